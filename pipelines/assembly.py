@@ -13,7 +13,7 @@ from curate.category_names import inline_table, listed, mapping
 from curate.consistency import ConsistencySettings
 from curate.datasets.base import Dataset
 from curate.datasets.frame_names import FrameNames
-from curate.detectors.base import Detector, TrainableDetector, choose_preset
+from curate.detectors.base import BatchDetector, Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError, CurateError, DataError, error_prefix
 from curate.exporters.base import DataToExport, Selective
 from curate.files.toml_text import toml_key
@@ -57,6 +57,15 @@ def check_detector(config: Config) -> None:
             options=config.detector.options,
         )
     trainable_detector(config)
+
+
+def batch_size(config: Config) -> int:
+    """Return how many frames the configured detector gets at a time."""
+    detector = registry.DETECTORS.load(config.detector.name)
+    if not (isinstance(detector, type) and issubclass(detector, BatchDetector)):
+        return 1
+    configured = config.detector.batch_size
+    return detector.batch_size(device(config)) if configured == "auto" else configured
 
 
 def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:

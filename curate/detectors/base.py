@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from curate.detections import Detections
-from curate.errors import ConfigError
+from curate.errors import ConfigError, CurateError
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.similarity import Similarity
@@ -29,6 +29,24 @@ class Detector(Protocol):
 
         Boxes are in the frame of reference of `frame.points`. The caller may have cropped these
         points to the camera's view or transformed them by a similarity.
+        """
+        ...
+
+
+@runtime_checkable
+class BatchDetector(Detector, Protocol):
+    """A detector that finds the boxes of several frames in one call."""
+
+    @classmethod
+    def batch_size(cls, device: str) -> int:
+        """Return how many frames it gets at a time by default on a device, "cpu" or "cuda"."""
+        ...
+
+    def predict_batch(self, frames: Sequence[Frame]) -> Sequence[Detections | CurateError]:
+        """Return the boxes of each frame as `predict` does, or the error of this frame alone.
+
+        The boxes of a frame do not depend on the other frames. If the call raises an error, it is
+        repeated with smaller batches, so that only frames fail that raise it by themselves.
         """
         ...
 

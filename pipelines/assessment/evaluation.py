@@ -29,7 +29,7 @@ from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import box_rectangles
-from pipelines.engine.executors.base import FrameJob
+from pipelines.engine.executors.base import FrameJob, batches_for
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import stored_round
@@ -107,7 +107,7 @@ def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str
     jobs = [FrameJob(key, name) for name, key in frames.items()]
     found: dict[str, Detections] = {}
     with progress.track("evaluate", len(jobs)) as advance, open_executor(workspace) as executor:
-        for outcome in executor.map(predict, jobs):
+        for outcome in executor.map(predict, batches_for(predict, jobs)):
             if outcome.error is not None:
                 raise FramesFailed(f"val {outcome.job.title}: {outcome.error}")
             for frame, rows in zip(outcome.job.frames, outcome.rows, strict=True):

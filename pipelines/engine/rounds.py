@@ -99,11 +99,15 @@ def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
 
 
 def _recorded_config(workspace: Workspace) -> str:
-    """Return the configuration as JSON, without executor, workers, threads and database URL.
+    """Return the configuration as JSON, without database URL and what changes only the speed.
 
     Processes that differ only in these can share a round, and the URL may contain a password.
     """
-    exclude = {"run": {"executor", "workers", "database"}, "train": {"threads"}}
+    exclude = {
+        "run": {"executor", "workers", "database"},
+        "detector": {"batch_size"},
+        "train": {"threads"},
+    }
     return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))
 
 

@@ -24,7 +24,9 @@ from pipelines.engine.executors.base import (
     Job,
     JobFunction,
     Outcome,
+    Part,
     SequenceJob,
+    batches_for,
 )
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.engine.plan import Plan, TaskKey, WaitingFrame, digest, is_current
@@ -222,14 +224,15 @@ def _outcomes(
     Frames with reusable measurements are processed last and in this process, without the executor.
     """
     if isinstance(stage, SequenceStage):
-        jobs: Iterator[Job] = _sequence_jobs(plan, plan.waiting_sequences(stage, split))
+        jobs: Iterator[Part] = _sequence_jobs(plan, plan.waiting_sequences(stage, split))
     else:
         frames = plan.waiting_frames(stage, split, measured=False)
         jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip)
     # Start the executor, which loads the models, only if there is a first job.
     for first in jobs:
         function: JobFunction = stage.function(plan.workspace, plan.context)
-        yield from executor.map(function, _Counted(chain([first], jobs), total))
+        batches = batches_for(function, chain([first], jobs))
+        yield from executor.map(function, _Counted(batches, total))
     if isinstance(stage, SequenceStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)

@@ -9,7 +9,7 @@ from sqlalchemy import Connection
 
 from curate.priors.base import Measured
 from curate.weighting.base import Age
-from pipelines.engine.executors.base import FrameFunction, SequenceFunction
+from pipelines.engine.executors.base import BatchFunction, FrameFunction, SequenceFunction
 from pipelines.engine.progress import Progress
 from pipelines.workspace.workspace import Workspace
 
@@ -155,11 +155,11 @@ class FrameStage(_FramesStage):
     """A stage that processes every frame by itself.
 
     Attributes:
-        function: function that returns what the stage does with a frame.
+        function: function that returns what the stage does with a frame, or a batch of frames.
         reusable: how it reuses its stored measurements; None if it has none.
     """
 
-    function: Callable[[Workspace, RoundContext], FrameFunction]
+    function: Callable[[Workspace, RoundContext], FrameFunction | BatchFunction]
     reusable: ReusableMeasurements | None = None
 
 

@@ -1,31 +1,33 @@
 """predict: l = f(x; w), the boxes of the teacher, including those with low scores."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from curate.category_names import renamed
 from curate.detections import Detections
-from curate.detectors.base import Detector, NamesCategories
-from curate.errors import ModelError
+from curate.detectors.base import BatchDetector, Detector, NamesCategories
+from curate.errors import CurateError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
 from curate.warnings_once import warn_once
 from db.models import BOX_COLUMNS
-from pipelines.assembly import check_detector, open_detector
+from pipelines.assembly import batch_size, check_detector, open_detector
 from pipelines.category_names import check_detector_names
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
+Item = TypeVar("Item")
+
 
 @dataclass
 class Predict:
-    """Predicts the boxes of a frame.
+    """Predicts the boxes of frames.
 
     Attributes:
         config: the configuration.
@@ -41,15 +43,56 @@ class Predict:
         self.detector = open_detector(self.config, self.teacher)
         check_detector_names(self.config, self.detector)
 
-    def __call__(self, job: FrameJob) -> FrameRows:
-        """Return the rows of `prediction`."""
-        found = self.detect(job.frame)
+    @property
+    def batch_size(self) -> int:
+        """How many frames the detector gets at a time."""
+        return batch_size(self.config)
+
+    def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
+        """Return the rows of `prediction` of each frame."""
+        found = self.detect([self.read(job.frame) for job in jobs])
+        return for_each(self._rows, found)
+
+    def read(self, frame_id: str) -> Frame:
+        """Return a frame as the detector sees it."""
+        return visible(self.dataset.read(frame_id), self.config)
+
+    def detect(self, frames: Sequence[Frame]) -> Sequence[Detections | CurateError]:
+        """Return what the detector finds in each frame, in one call if it takes batches.
+
+        Raises:
+            ModelError: if it returns too few or too many results.
+        """
+        if not isinstance(self.detector, BatchDetector):
+            return [self.detector.predict(frame) for frame in frames]
+        found = self.detector.predict_batch(frames)
+        if len(found) != len(frames):
+            raise ModelError(f"the detector returned {len(found)} results for {len(frames)} frames")
+        return found
+
+    def checked(self, found: Detections) -> Detections:
+        """Return the detections that count, by descending score."""
+        return checked(found, self.config, self.detector)
+
+    def _rows(self, found: Detections | CurateError) -> FrameRows:
+        if isinstance(found, CurateError):
+            raise found
+        found = self.checked(found)
         return {"prediction": {**detection_columns(found), "iou": _or_none(found.iou)}}
 
-    def detect(self, frame_id: str) -> Detections:
-        """Return the detections of a frame, by descending score."""
-        frame = visible(self.dataset.read(frame_id), self.config)
-        return checked(self.detector.predict(frame), self.config, self.detector)
+
+def for_each(
+    function: Callable[[Item], FrameRows], items: Iterable[Item]
+) -> list[FrameRows | CurateError]:
+    """Return the rows of each item, or the error that the function raised."""
+    return [_rows_or_error(function, item) for item in items]
+
+
+def _rows_or_error(function: Callable[[Item], FrameRows], item: Item) -> FrameRows | CurateError:
+    try:
+        return function(item)
+    except CurateError as error:
+        return error
 
 
 def visible(frame: Frame, config: Config) -> Frame:
@@ -144,7 +187,7 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     config = workspace.config
     return {
         "detector": config.detector.model_dump(
-            mode="json", exclude={"path", *unset_rename(config.detector)}
+            mode="json", exclude={"path", "batch_size", *unset_rename(config.detector)}
         ),
         "files": option_files(config),
         "categories": config.dataset.categories,

@@ -10,33 +10,56 @@ import numpy as np
 from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import RecordedViews
-from curate.errors import WorkspaceError
+from curate.errors import CurateError, WorkspaceError
 from curate.geometry.similarity import Similarity
 from pipelines.assembly import consistency_settings
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
-from pipelines.stages.predict import Predict, checked, detection_columns, visible
+from pipelines.stages.predict import Predict, detection_columns, for_each
 from pipelines.workspace.config import RepredictSection
 from pipelines.workspace.workspace import Workspace
 
-View = tuple[Similarity, Detections]
+View = tuple[Similarity, Detections | CurateError]
 
 
 class Repredict(Predict):
-    """Predicts augmented copies of a frame, and compares them with the frame's predictions."""
+    """Predicts augmented copies of frames, and compares them with the frames' predictions."""
 
     def __init__(self, predict: Predict, seed: int, round_number: int) -> None:
         super().__init__(predict.config, predict.teacher)
         self.seed = seed
         self.round_number = round_number
 
-    def __call__(self, job: FrameJob) -> FrameRows:
-        """Return the rows of `reprediction_view`, `reprediction` and `consistency`."""
+    @property
+    def batch_size(self) -> int:
+        """How many frames have together as many copies as the detector gets at a time."""
+        return max(1, super().batch_size // self.config.repredict.views)
+
+    def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
+        """Return the rows of `reprediction_view`, `reprediction` and `consistency`, by frame."""
+        views = self.views([job.frame for job in jobs])
+        return for_each(lambda each: self._compared(*each), zip(jobs, views, strict=True))
+
+    def views(self, frame_ids: Sequence[str]) -> list[Sequence[View]]:
+        """Return for each frame its similarities A, with what the detector finds in A(x)."""
+        if isinstance(self.detector, RecordedViews):
+            return [self.detector.views(frame_id) for frame_id in frame_ids]
+        section = self.config.repredict
+        drawn = [draw(self.seed, self.round_number, each, section) for each in frame_ids]
+        copies = []
+        for frame_id, similarities in zip(frame_ids, drawn, strict=True):
+            frame = self.read(frame_id)
+            copies += [frame.with_points(a.apply_to_points(frame.points)) for a in similarities]
+        found = iter(self.detect(copies))
+        return [[(a, next(found)) for a in similarities] for similarities in drawn]
+
+    def _compared(self, job: FrameJob, found: Sequence[View]) -> FrameRows:
+        """Return the rows of a frame."""
         if job.predictions is None:
             raise WorkspaceError(f"frame {job.frame}: the job has no predictions")
-        views = self.views(job.frame)
+        views = [(a, self._in_frame(a, each)) for a, each in found]
         settings = consistency_settings(self.config)
-        losses = [consistency(job.predictions, found, settings) for _, found in views]
+        losses = [consistency(job.predictions, each, settings) for _, each in views]
         return {
             "reprediction_view": {
                 "view": list(range(len(views))),
@@ -46,30 +69,18 @@ class Repredict(Predict):
             },
             "reprediction": _concatenate(
                 [
-                    _reprediction_columns(view, found, loss)
-                    for view, ((_, found), loss) in enumerate(zip(views, losses, strict=True))
+                    _reprediction_columns(view, each, loss)
+                    for view, ((_, each), loss) in enumerate(zip(views, losses, strict=True))
                 ]
             ),
             "consistency": _consistency_columns(losses, len(job.predictions)),
         }
 
-    def views(self, frame_id: str) -> list[View]:
-        """Return each similarity A with its detections, mapped back to the frame by A^-1."""
-        if isinstance(self.detector, RecordedViews):
-            views = list(self.detector.views(frame_id))
-        else:
-            frame = visible(self.dataset.read(frame_id), self.config)
-            drawn = draw(self.seed, self.round_number, frame_id, self.config.repredict)
-            views = [
-                (a, self.detector.predict(frame.with_points(a.apply_to_points(frame.points))))
-                for a in drawn
-            ]
-        return [(a, self._checked(a, found)) for a, found in views]
-
-    def _checked(self, similarity: Similarity, found: Detections) -> Detections:
+    def _in_frame(self, similarity: Similarity, found: Detections | CurateError) -> Detections:
         """Return the detections of an augmented copy in the frame's own frame of reference."""
-        boxes = similarity.invert_boxes(found.boxes)
-        return checked(replace(found, boxes=boxes), self.config, self.detector)
+        if isinstance(found, CurateError):
+            raise found
+        return self.checked(replace(found, boxes=similarity.invert_boxes(found.boxes)))
 
 
 def draw(

@@ -195,6 +195,12 @@ class DetectorSection(Section):
         "which labels count.",
         json_schema_extra=_unit("1"),
     )
+    batch_size: AtLeastOne | Literal["auto"] = Field(
+        default="auto",
+        description="Frames that a detector which takes batches gets at a time. 'auto': as the "
+        "detector prefers on its device. It changes no prediction.",
+        json_schema_extra=_unit("frames"),
+    )
     camera_view: bool = Field(
         default=True,
         description="Whether the detector gets only the points that the camera sees.",

@@ -11,7 +11,7 @@ from contracts.samples import assert_one_line, assert_same, sample_of
 from support.tiny_onnx import tiny_detector
 
 from curate.detections import CATEGORIES, Detections
-from curate.detectors.base import RecordedViews
+from curate.detectors.base import BatchDetector, RecordedViews
 from curate.detectors.pillars.checkpoint import save_checkpoint
 from curate.detectors.pillars.network import PillarNetwork, checkpoint_of
 from curate.detectors.pillars.presets import PRESETS
@@ -123,6 +123,17 @@ def test_predictions_do_not_depend_on_earlier_calls(made, detector, frames) -> N
     for frame, expected in reversed(list(zip(frames, before, strict=True))):
         assert_same(other.predict(frame), expected)
         assert_same(detector.predict(frame), expected)
+
+
+def test_the_boxes_of_a_frame_do_not_depend_on_its_batch(detector, frames) -> None:
+    """A batch of one frame, several frames, and another order."""
+    if not isinstance(detector, BatchDetector):
+        pytest.skip("it takes one frame at a time")
+    expected = [detector.predict(frame) for frame in frames]
+    for order in ([0], [*range(len(frames))], [*reversed(range(len(frames)))]):
+        found = detector.predict_batch([frames[i] for i in order])
+        for i, each in zip(order, found, strict=True):
+            assert_same(each, expected[i])
 
 
 def test_predictions_do_not_depend_on_the_order_of_the_points(detector, frames) -> None:

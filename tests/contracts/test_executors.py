@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 from contracts.samples import assert_one_line
-from support.frame_functions import Deadly, Square
+from support.frame_functions import Deadly, Square, SquareBatches
 from support.rounds import run_workspace
 from support.stored_rows import dump
 from support.toys import toy_document, write_toy_kitti
 
 from curate.errors import CurateError, ModelError
 from pipelines.engine.executors.auto import AutoExecutor
-from pipelines.engine.executors.base import Executor, FrameJob
+from pipelines.engine.executors.base import Executor, FrameJob, batches_for
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.registry import EXECUTORS
 from pipelines.workspace.config import make_config
@@ -123,6 +123,41 @@ def test_only_the_frame_that_kills_its_workers_fails(crew: Executor, tmp_path: P
     assert failed[5].rows == ()
     assert failed[5].error.startswith("frame 000005: its worker died 2 times, ")
     assert_one_line(Exception(failed[5].error))
+
+
+def batch_outcomes(executor: Executor, function: SquareBatches) -> dict[int, str | list]:
+    """Return the row or the error of each frame."""
+    found = list(executor.map(function, batches_for(function, JOBS)))
+    assert sorted(outcome.job.frame_id for outcome in found) == list(range(50))
+    return {
+        outcome.job.frame_id: outcome.error or [rows["squares"]["value"] for rows in outcome.rows]
+        for outcome in found
+    }
+
+
+def test_a_frame_of_a_batch_fails_alone(executor: Executor, tmp_path: Path) -> None:
+    """With an error of its own, or after its batch was halved until only it was left."""
+    found = batch_outcomes(executor, SquareBatches(tmp_path))
+    for key, result in found.items():
+        if key % 7 == 3:
+            assert result == f"frame {key:06d}: ValueError: a batch is spoilt"
+        else:
+            assert result == (f"frame {key}: empty" if key % 7 == 4 else [[key**2]])
+    sizes = [int(path.name.split("-")[1]) for path in tmp_path.iterdir()]
+    assert max(sizes) == 8
+    assert len(sizes) < 50 + 7 * 6  # seven batches, each with one frame that spoils it
+
+
+def test_only_the_frame_of_a_batch_that_kills_its_workers_fails(
+    crew: Executor, tmp_path: Path
+) -> None:
+    """The batch of a killed worker is halved, and the frame is tried twice alone."""
+    found = batch_outcomes(crew, SquareBatches(tmp_path, deadly=(12,), batch_size=16))
+    assert found[12].startswith("frame 000012: its worker died 2 times, ")
+    wrong = [
+        key for key, result in found.items() if isinstance(result, str) and key % 7 not in (3, 4)
+    ]
+    assert wrong == [12]
 
 
 def test_workers_that_die_while_loading_end_the_run(crew: Executor) -> None:

@@ -4,13 +4,13 @@ import os
 import signal
 import time
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from curate.errors import ModelError
+from curate.errors import CurateError, DataError, ModelError
 from pipelines.engine.executors.base import FrameFunction, FrameJob, FrameRows, Outcome
 from pipelines.engine.executors.serial import SerialExecutor
 
@@ -61,6 +61,36 @@ class Deadly(Square):
             died.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return {"squares": {"value": [job.frame_id**2]}}
+
+
+@dataclass
+class SquareBatches:
+    """Square the keys of a batch. Some keys fail alone, some spoil their batch or kill the worker.
+
+    Attributes:
+        folder: where it records the batches: the first key, and the number of frames.
+        deadly: frames that kill the worker.
+    """
+
+    folder: Path
+    deadly: tuple[int, ...] = ()
+    batch_size: int = 8
+
+    def open(self) -> None:
+        """Do nothing."""
+
+    def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
+        """Return one row per frame."""
+        keys = [job.frame_id for job in jobs]
+        (self.folder / f"{keys[0]}-{len(keys)}-{uuid.uuid4()}").touch()
+        if any(key in self.deadly for key in keys):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if any(key % 7 == 3 for key in keys):
+            raise ValueError("a batch\nis spoilt")
+        return [
+            DataError(f"frame {key}: empty") if key % 7 == 4 else {"squares": {"value": [key**2]}}
+            for key in keys
+        ]
 
 
 class Shuffled:

@@ -13,6 +13,7 @@ from curate.datasets.kitti.calibration import write_calibration
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.datasets.kitti.labels import from_annotations, write_objects
 from curate.detections import Annotations, Detections
+from curate.errors import CurateError, DataError
 from curate.frames import Calibration, Frame
 from curate.priors.base import (
     Column,
@@ -138,6 +139,23 @@ class ToyDetector:
             np.array([score for _, score, _ in found], dtype=np.float64),
             np.array([category for category, _, _ in found], dtype=np.str_),
         )
+
+
+class ToyBatchDetector(ToyDetector):
+    """The same detector for batches; a frame that raises spoils its batch."""
+
+    @classmethod
+    def batch_size(cls, device: str) -> int:
+        """Return how many frames it prefers."""
+        return 5
+
+    def predict_batch(self, frames: Sequence[Frame]) -> list[Detections | CurateError]:
+        """Return the boxes of each frame; a frame with no points has an error of its own."""
+        found = [self.predict(frame) for frame in frames]
+        return [
+            each if len(frame.points) else DataError(f"frame {frame.frame_id}: no points")
+            for frame, each in zip(frames, found, strict=True)
+        ]
 
 
 class ToySegmenter:

@@ -15,7 +15,13 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from statistics import median
 
-from pipelines.engine.executors.base import FunctionHolder, Job, JobFunction, Outcome
+from pipelines.engine.executors.base import (
+    FunctionHolder,
+    Job,
+    JobFunction,
+    Outcome,
+    outcomes_of,
+)
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
 from pipelines.engine.executors.process import ProcessExecutor
 from pipelines.engine.executors.serial import SerialExecutor
@@ -40,7 +46,7 @@ class AutoExecutor:
         self._pool: ProcessExecutor | None = None
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """Yield one outcome per job; the order is that of the jobs unless workers are started.
+        """Yield one outcome per frame or sequence, in their order unless workers are started.
 
         Args:
             function: what to do with a job.
@@ -63,9 +69,9 @@ class AutoExecutor:
         seconds: list[float] = []
         while batch := list(islice(jobs, MEASURED_JOBS)):
             for job in batch:
-                outcome = Outcome(job, *here.work(job))
-                seconds.append(outcome.seconds)
-                yield outcome
+                results = here.work(job)
+                seconds.append(sum(result.seconds for result in results))
+                yield from outcomes_of(job, results)
             left = operator.length_hint(jobs, -1)
             if self._saves_time(left, median(seconds[1:] or seconds), opening_s):
                 workers = min(affordable_workers(self._limit), max(left, 0) or self._limit)

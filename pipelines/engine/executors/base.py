@@ -6,12 +6,13 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from curate.detections import Detections
 from curate.errors import CurateError, ModelError, one_line
+from curate.files.batches import batched
 
 logger = logging.getLogger(__name__)
 
@@ -50,9 +51,41 @@ class FrameJob:
         return (self,)
 
     @property
+    def parts(self) -> "tuple[Part, ...]":
+        """The job itself: it succeeds or fails as a whole."""
+        return (self,)
+
+    @property
     def title(self) -> str:
         """The name of the job in messages."""
         return f"frame {self.frame}"
+
+
+@dataclass(frozen=True)
+class BatchJob:
+    """Several frames to process in one call; each succeeds or fails by itself.
+
+    Attributes:
+        frames: the frames.
+    """
+
+    frames: tuple[FrameJob, ...]
+
+    @property
+    def parts(self) -> "tuple[Part, ...]":
+        """The jobs that succeed or fail by themselves: the frames."""
+        return self.frames
+
+    @property
+    def title(self) -> str:
+        """The name of the job in messages."""
+        first, last = self.frames[0].frame, self.frames[-1].frame
+        return f"frame {first}" if first == last else f"frames {first} to {last}"
+
+    def halves(self) -> "list[BatchJob]":
+        """Return the batch in two parts, to find the frame at fault; nothing for one frame."""
+        middle = len(self.frames) // 2
+        return [BatchJob(self.frames[:middle]), BatchJob(self.frames[middle:])] if middle else []
 
 
 @dataclass(frozen=True)
@@ -68,12 +101,18 @@ class SequenceJob:
     frames: tuple[FrameJob, ...]
 
     @property
+    def parts(self) -> "tuple[Part, ...]":
+        """The job itself: it succeeds or fails as a whole."""
+        return (self,)
+
+    @property
     def title(self) -> str:
         """The name of the job in messages."""
         return f"sequence {self.name}"
 
 
-Job = FrameJob | SequenceJob
+Part = FrameJob | SequenceJob
+Job = FrameJob | BatchJob | SequenceJob
 
 
 class FrameFunction(Protocol):
@@ -88,6 +127,31 @@ class FrameFunction(Protocol):
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Return the frame's rows; an error here fails only this frame."""
+        ...
+
+
+@runtime_checkable
+class BatchFunction(Protocol):
+    """What a stage does with several frames in one call.
+
+    It is pickled and sent to the workers, so it loads nothing large before `open`.
+    """
+
+    @property
+    def batch_size(self) -> int:
+        """The most frames of a call. The rows do not depend on it."""
+        ...
+
+    def open(self) -> None:
+        """Load the models and the data set; an error here ends the run."""
+        ...
+
+    def batch(self, jobs: Sequence[FrameJob]) -> Sequence[FrameRows | CurateError]:
+        """Return the rows of each frame, or the error that fails only this frame.
+
+        If the call raises an error, it is repeated with smaller batches, so that only the frames
+        fail that raise it by themselves.
+        """
         ...
 
 
@@ -106,21 +170,29 @@ class SequenceFunction(Protocol):
         ...
 
 
-JobFunction = FrameFunction | SequenceFunction
+JobFunction = FrameFunction | BatchFunction | SequenceFunction
+
+
+def batches_for(function: JobFunction, jobs: Iterable[Part]) -> Iterator[Job]:
+    """Return the jobs, in batches if the function processes several frames in one call."""
+    if not isinstance(function, BatchFunction):
+        return iter(jobs)
+    frames = (frame for job in jobs for frame in job.frames)
+    return (BatchJob(tuple(batch)) for batch in batched(frames, function.batch_size))
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of a job.
+    """The result of a frame or sequence.
 
     Attributes:
-        job: the job.
-        rows: rows of each of its frames, in order; empty if the job failed.
-        error: error message in one line; None if the job succeeded.
-        seconds: time that the job took.
+        job: the frame or sequence.
+        rows: rows of each of its frames, in order; empty if it failed.
+        error: error message in one line; None if it succeeded.
+        seconds: time that it took; for a frame of a batch, its share.
     """
 
-    job: Job
+    job: Part
     rows: Sequence[FrameRows]
     error: str | None
     seconds: float
@@ -130,11 +202,11 @@ class Executor(Protocol):
     """Maps a function over frames or sequences, and yields their outcomes in any order.
 
     It takes a bounded number of jobs ahead. If a worker crashes, only the job in progress loses one
-    of its tries; the other jobs of the worker are requeued.
+    of its tries; the other jobs of the worker are requeued. A batch in progress is halved.
     """
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """Yield one outcome per job.
+        """Yield one outcome per frame or sequence of the jobs.
 
         Raises:
             CurateError: if the models cannot be loaded.
@@ -193,12 +265,15 @@ class JobQueue:
         started, rest = in_flight[:1], in_flight[1:]
         self.return_jobs(rest)
         for job in started:
+            if isinstance(job, BatchJob) and (halves := job.halves()):
+                self._again.extendleft(reversed(halves))
+                continue
             self._crashes[job.title] += 1
             if self._crashes[job.title] < MAX_TRIES:
                 self._again.appendleft(job)
             else:
                 error = f"{job.title}: its worker died {MAX_TRIES} times, {reason}"
-                yield Outcome(job, (), error, 0.0)
+                yield from outcomes_of(job, [Result((), error, 0.0)])
 
 
 def open_function(function: JobFunction) -> None:
@@ -235,32 +310,72 @@ class FunctionHolder:
         self.function = function
         return None
 
-    def work(self, job: Job) -> tuple[Sequence[FrameRows], str | None, float]:
-        """Return rows, error and seconds of a job, see `Outcome`.
+    def work(self, job: Job) -> "list[Result]":
+        """Return the results of the parts of a job.
 
         Raises:
             CurateError: if no function is loaded.
         """
         if self.function is None:
             raise CurateError("a worker got a job before it had loaded the models")
-        outcome = attempt(self.function, job)
-        return outcome.rows, outcome.error, outcome.seconds
+        return attempt(self.function, job)
 
 
-def attempt(function: Any, job: Job) -> Outcome:
-    """Run a job and return its outcome; an exception makes the outcome a failed one."""
+class Result(NamedTuple):
+    """What a worker returns for a frame or sequence: an `Outcome` without the job."""
+
+    rows: Sequence[FrameRows]
+    error: str | None
+    seconds: float
+
+
+def outcomes_of(job: Job, results: Sequence[Result]) -> Iterator[Outcome]:
+    """Yield the outcomes of the parts of a job."""
+    for part, result in zip(job.parts, results, strict=True):
+        yield Outcome(part, *result)
+
+
+def attempt(function: Any, job: Job) -> list[Result]:
+    """Run a job and return the results of its parts; an exception makes a failed one.
+
+    A batch that raises an exception is halved, until only the frames that raise it are left.
+    """
     start = time.perf_counter()
-    rows: Sequence[FrameRows] = ()
-    error = None
+    found: Sequence[Sequence[FrameRows] | Exception]
     try:
-        found = function(job)
-        rows = (found,) if isinstance(job, FrameJob) else tuple(found)
-        if len(rows) != len(job.frames):
-            error, rows = f"{job.title}: {len(rows)} results for {len(job.frames)} frames", ()
-    except CurateError as raised:
-        error = str(raised)
-    except Exception as raised:
+        found = _run(function, job)
+    except Exception as error:
         # A user's model may raise anything; only this job fails, not the run.
         logger.debug("%s failed", job.title, exc_info=True)
-        error = f"{job.title}: {type(raised).__name__}: {one_line(raised, 500)}"
-    return Outcome(job, rows, error, time.perf_counter() - start)
+        if isinstance(job, BatchJob) and (halves := job.halves()):
+            return [result for half in halves for result in attempt(function, half)]
+        found = [error]
+    seconds = (time.perf_counter() - start) / len(job.parts)
+    return [
+        Result((), _message(part, each), seconds)
+        if isinstance(each, Exception)
+        else Result(each, None, seconds)
+        for part, each in zip(job.parts, found, strict=True)
+    ]
+
+
+def _run(function: Any, job: Job) -> Sequence[Sequence[FrameRows] | CurateError]:
+    """Return for each part of a job the rows of its frames, or its error.
+
+    Raises:
+        CurateError: if the function returns too few or too many results.
+    """
+    if isinstance(job, FrameJob):
+        return [(function(job),)]
+    found = tuple(function.batch(job.frames) if isinstance(job, BatchJob) else function(job))
+    if len(found) != len(job.frames):
+        raise CurateError(f"{job.title}: {len(found)} results for {len(job.frames)} frames")
+    if isinstance(job, BatchJob):
+        return [rows if isinstance(rows, CurateError) else (rows,) for rows in found]
+    return [found]
+
+
+def _message(job: Job, error: Exception) -> str:
+    if isinstance(error, CurateError):
+        return str(error)
+    return f"{job.title}: {type(error).__name__}: {one_line(error, 500)}"

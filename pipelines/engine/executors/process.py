@@ -24,6 +24,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
+    outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
 
@@ -44,7 +45,7 @@ class ProcessExecutor:
         self._workers: list[_Worker] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """Yield one outcome per job, in the order in which they end.
+        """Yield one outcome per frame or sequence, in the order in which they end.
 
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
@@ -102,7 +103,7 @@ class ProcessExecutor:
             worker.opened = True
             queue.record_opened()
         else:
-            yield Outcome(worker.in_flight.popleft(), *result)
+            yield from outcomes_of(worker.in_flight.popleft(), result)
 
     def _dismiss(self, worker: "_Worker") -> None:
         self._workers.remove(worker)

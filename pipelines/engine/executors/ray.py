@@ -20,6 +20,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
+    outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
 
@@ -68,7 +69,7 @@ class RayExecutor:
         self._actors: list[_Actor] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
-        """Yield one outcome per job, in the order in which they end.
+        """Yield one outcome per frame or sequence, in the order in which they end.
 
         Raises:
             CurateError: if the models cannot be loaded, actors crash while they load them, or the
@@ -138,7 +139,7 @@ class RayExecutor:
             raise result
         actor.results.popleft()
         if actor.opened:
-            yield Outcome(actor.jobs.popleft(), *result)
+            yield from outcomes_of(actor.jobs.popleft(), result)
         elif actor.placed:
             actor.opened = True
             queue.record_opened()
