@@ -1,6 +1,5 @@
 """repredict: l' = A^-1 f(A(x); w), and its disagreement with l, the loss L of Eqs. 4 to 11."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,12 +10,13 @@ from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import RecordedViews
 from curate.errors import CurateError, WorkspaceError
+from curate.geometry.augmentation import Augmentation
 from curate.geometry.similarity import Similarity
 from pipelines.assembly import consistency_settings
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.stages.predict import Predict, detection_columns, for_each
-from pipelines.workspace.config import RepredictSection
+from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections | CurateError]
@@ -44,14 +44,10 @@ class Repredict(Predict):
         """Return for each frame its similarities A, with what the detector finds in A(x)."""
         if isinstance(self.detector, RecordedViews):
             return [self.detector.views(frame_id) for frame_id in frame_ids]
-        section = self.config.repredict
-        drawn = [draw(self.seed, self.round_number, each, section) for each in frame_ids]
-        copies = []
-        for frame_id, similarities in zip(frame_ids, drawn, strict=True):
-            frame = self.read(frame_id)
-            copies += [frame.with_points(a.apply_to_points(frame.points)) for a in similarities]
-        found = iter(self.detect(copies))
-        return [[(a, next(found)) for a in similarities] for similarities in drawn]
+        drawn = augmentation(self.config, self.seed, self.round_number)
+        copies = [[*drawn.copies(self.read(frame_id))] for frame_id in frame_ids]
+        found = iter(self.detect([copy for each in copies for _, copy in each]))
+        return [[(a, next(found)) for a, _ in each] for each in copies]
 
     def _compared(self, job: FrameJob, found: Sequence[View]) -> FrameRows:
         """Return the rows of a frame."""
@@ -83,21 +79,17 @@ class Repredict(Predict):
         return self.checked(replace(found, boxes=similarity.invert_boxes(found.boxes)))
 
 
-def draw(
-    seed: int, round_number: int, frame_id: str, section: RepredictSection
-) -> list[Similarity]:
-    """Return the similarities A of a frame, drawn from seed, round and frame id alone."""
-    digest = hashlib.sha256(frame_id.encode()).digest()
-    generator = np.random.default_rng([seed, round_number, *digest])
-    return [
-        Similarity.draw(
-            generator,
-            flip_probability=section.flip_probability,
-            rotation_limit_rad=section.rotation_limit_rad,
-            scale_range=section.scale_range,
-        )
-        for _ in range(section.views)
-    ]
+def augmentation(config: Config, seed: int, round_number: int) -> Augmentation:
+    """Return the augmented copies of a round."""
+    section = config.repredict
+    return Augmentation(
+        seed,
+        round_number,
+        section.views,
+        section.flip_probability,
+        section.rotation_limit_rad,
+        section.scale_range,
+    )
 
 
 def settings(workspace: Workspace, context: RoundContext) -> Settings:

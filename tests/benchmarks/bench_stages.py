@@ -141,10 +141,10 @@ def bench_predict(benchmark, workspace):
 
 def bench_repredict(benchmark, workspace, context, guesses):
     """Read, crop, augment, map the boxes back, match, compute the consistency loss."""
-    section = workspace.config.repredict
+    drawn = repredict.augmentation(workspace.config, context.seed, context.number)
     answers = {}
     for name, found in guesses.items():
-        [similarity] = repredict.draw(context.seed, context.number, name, section)
+        [similarity] = drawn.draw(name)
         boxes = similarity.apply_to_boxes(found.boxes)
         answers[name] = type(found)(boxes, found.scores, found.categories)
     stage = repredict.function(workspace, context)
