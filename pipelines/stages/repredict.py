@@ -10,13 +10,12 @@ from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import RecordedViews
 from curate.errors import CurateError, WorkspaceError
-from curate.geometry.augmentation import Augmentation
 from curate.geometry.similarity import Similarity
-from pipelines.assembly import consistency_settings
+from pipelines.assembly import consistency_settings, copies_folder
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
+from pipelines.stages.copies import augmented_views, copies_fingerprint
 from pipelines.stages.predict import Predict, detection_columns, for_each
-from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections | CurateError]
@@ -26,7 +25,7 @@ class Repredict(Predict):
     """Predicts augmented copies of frames, and compares them with the frames' predictions."""
 
     def __init__(self, predict: Predict, seed: int, round_number: int) -> None:
-        super().__init__(predict.config, predict.teacher)
+        super().__init__(predict.config, predict.teacher, round_number)
         self.seed = seed
         self.round_number = round_number
 
@@ -44,7 +43,7 @@ class Repredict(Predict):
         """Return for each frame its similarities A, with what the detector finds in A(x)."""
         if isinstance(self.detector, RecordedViews):
             return [self.detector.views(frame_id) for frame_id in frame_ids]
-        drawn = augmentation(self.config, self.seed, self.round_number)
+        drawn = augmented_views(self.config, self.seed, self.round_number)
         copies = [[*drawn.copies(self.read(frame_id))] for frame_id in frame_ids]
         found = iter(self.detect([copy for each in copies for _, copy in each]))
         return [[(a, next(found)) for a, _ in each] for each in copies]
@@ -79,23 +78,12 @@ class Repredict(Predict):
         return self.checked(replace(found, boxes=similarity.invert_boxes(found.boxes)))
 
 
-def augmentation(config: Config, seed: int, round_number: int) -> Augmentation:
-    """Return the augmented copies of a round."""
-    section = config.repredict
-    return Augmentation(
-        seed,
-        round_number,
-        section.views,
-        section.flip_probability,
-        section.rotation_limit_rad,
-        section.scale_range,
-    )
-
-
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
     """Return what repredictions depend on besides predictions and teacher."""
     section = workspace.config.repredict.model_dump(mode="json")
-    return {**section, "seed": context.seed, "round": context.number}
+    folder = copies_folder(workspace.config, context.number)
+    copies = {} if folder is None else {"copies": copies_fingerprint(folder)}
+    return {**section, **copies, "seed": context.seed, "round": context.number}
 
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:

@@ -14,6 +14,7 @@ from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.stage import RoundContext, Teacher
 from pipelines.labels.sources import source_of
 from pipelines.stages import predict, repredict, score
+from pipelines.stages.copies import augmented_views
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 
@@ -141,7 +142,7 @@ def bench_predict(benchmark, workspace):
 
 def bench_repredict(benchmark, workspace, context, guesses):
     """Read, crop, augment, map the boxes back, match, compute the consistency loss."""
-    drawn = repredict.augmentation(workspace.config, context.seed, context.number)
+    drawn = augmented_views(workspace.config, context.seed, context.number)
     answers = {}
     for name, found in guesses.items():
         [similarity] = drawn.draw(name)
