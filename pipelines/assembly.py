@@ -16,6 +16,7 @@ from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import BatchDetector, Detector, TrainableDetector, choose_preset
 from curate.errors import ConfigError, CurateError, DataError, error_prefix
 from curate.exporters.base import DataToExport, Selective
+from curate.files.onnx_providers import CPU
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
@@ -25,6 +26,12 @@ from curate.segmenters.base import DeclaresClasses, Segmenter
 from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
 from curate.weighting.base import Policy
 from pipelines import registry
+from pipelines.devices import (
+    Place,
+    check_detector_place,
+    check_segmenter_place,
+    detector_place,
+)
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import open_dataset
 
@@ -84,6 +91,7 @@ def check_detector(config: Config) -> None:
             offered=_offered_to_detectors(config),
             options=config.detector.options,
         )
+    check_detector_place(config)
     trainable_detector(config)
 
 
@@ -92,19 +100,26 @@ def batch_size(config: Config) -> int:
     detector = registry.DETECTORS.load(config.detector.name)
     if not (isinstance(detector, type) and issubclass(detector, BatchDetector)):
         return 1
-    configured = config.detector.batch_size
-    return detector.batch_size(device(config)) if configured == "auto" else configured
+    if config.detector.batch_size != "auto":
+        return config.detector.batch_size
+    place = detector_place(config) or Place()
+    return detector.batch_size(place.hardware)
 
 
 def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
+    def place() -> Place:
+        return detector_place(config) or Place()
+
     return {
         "minimum_score": lambda: config.detector.minimum_score,
-        "device": lambda: device(config),
         "categories": lambda: config.dataset.categories,
         "threads": lambda: 1,
         "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
         "calibration": lambda: _calibrations(config),
         "wants_views": lambda: wants_views(config),
+        "device": lambda: place().device or CPU.name,
+        "providers": lambda: place().providers,
+        "provider_options": lambda: place().options,
     }
 
 
@@ -162,15 +177,6 @@ def _calibrations(config: Config) -> Callable[[str], Calibration]:
     return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
-def device(config: Config) -> str:
-    """Return the device of the detector: "cpu" or "cuda"."""
-    if config.detector.device != "auto":
-        return config.detector.device
-    import torch
-
-    return "cuda" if torch.cuda.is_available() else "cpu"
-
-
 def open_segmenter(config: Config) -> Segmenter:
     """Return the segmenter.
 
@@ -195,6 +201,8 @@ def open_segmenter(config: Config) -> Segmenter:
             "classes": lambda: _class_map(name, classes),
             "seed": lambda: config.run.seed,
             "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
+            "providers": lambda: section.providers,
+            "provider_options": lambda: section.provider_options,
         },
         options=section.options,
     )
@@ -252,9 +260,10 @@ def check_segmenter(config: Config) -> None:
             registry.SEGMENTERS.check(
                 name,
                 segmenter_path(config),
-                offered=("classes", "seed", "frame_ids"),
+                offered=("classes", "seed", "frame_ids", "providers", "provider_options"),
                 options=config.segmenter.options,
             )
+        check_segmenter_place(config)
 
 
 def _class_map(segmenter: str, classes: str | None) -> Mapping[str, tuple[int, ...]]:

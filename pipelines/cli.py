@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 
 import curate
 from curate.errors import CurateError
+from curate.warnings_once import NOTES
 from pipelines.commands.audit import audit
 from pipelines.commands.augment import augment
 from pipelines.commands.bench import bench, bench_cell
@@ -127,8 +128,9 @@ class _CurrentStderr(logging.StreamHandler[TextIO]):
 
 
 def log_warnings() -> None:
-    """Print warnings to standard error, above a progress bar if there is one."""
+    """Print warnings and notes to standard error, above a progress bar if there is one."""
     logging.basicConfig(level=logging.WARNING, handlers=[_CurrentStderr()])
+    logging.getLogger(NOTES).setLevel(logging.INFO)
 
 
 def main() -> None:

@@ -26,9 +26,9 @@ LAYERS = {
         "review", "training", "__main__",
     ),
     "pipelines": (
-        "user_modules", "registry", "workspace", "assembly", "category_names", "engine", "labels",
-        "firewall", "review", "stages", "round", "assessment", "queries", "reports", "serving",
-        "bench", "demo", "commands", "cli", "__main__",
+        "user_modules", "registry", "workspace", "devices", "assembly", "category_names", "engine",
+        "labels", "firewall", "review", "stages", "round", "assessment", "queries", "reports",
+        "serving", "bench", "demo", "commands", "cli", "__main__",
     ),
 }  # fmt: skip
 MODULES = sorted(path for folder in MAY_IMPORT for path in (ROOT / folder).rglob("*.py"))

@@ -39,7 +39,11 @@ class BatchDetector(Detector, Protocol):
 
     @classmethod
     def batch_size(cls, device: str) -> int:
-        """Return how many frames it gets at a time by default on a device, "cpu" or "cuda"."""
+        """Return how many frames it gets at a time by default.
+
+        Args:
+            device: a device of torch, or a provider of ONNX Runtime, such as "cpu" or "cuda".
+        """
         ...
 
     def predict_batch(self, frames: Sequence[Frame]) -> Sequence[Detections | CurateError]:

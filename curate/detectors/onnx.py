@@ -18,6 +18,7 @@ from curate.detectors.conventions import BoxConvention
 from curate.detectors.onnx_outputs import find_outputs, raw_boxes
 from curate.detectors.scores import describe_invalid_scores, to_probabilities
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import OnnxModel
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -28,7 +29,7 @@ _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(d
 
 
 class OnnxDetector:
-    """A `Detector` that runs an ONNX model on the CPU.
+    """A `Detector` that runs an ONNX model.
 
     Args:
         model: the .onnx file.
@@ -47,12 +48,15 @@ class OnnxDetector:
         preprocess: `package.module:function` from (n, 4) points to the model's inputs by name.
         postprocess: `package.module:function` from the outputs by name to `boxes`, `scores` and
             `labels` by name.
-        threads: number of threads of ONNX Runtime.
+        threads: number of threads of ONNX Runtime on the CPU.
+        providers: where the model runs: "auto", a provider such as "cuda", or several.
+        provider_options: options of ONNX Runtime's providers by their names.
 
     Raises:
         ModelError: if the file is missing or not an ONNX model, or its inputs or outputs do not
             fit.
-        ConfigError: if an option is invalid, or a function cannot be imported.
+        ConfigError: if an option is invalid, a function cannot be imported, or a listed provider
+            cannot be used.
     """
 
     def __init__(
@@ -72,6 +76,8 @@ class OnnxDetector:
         preprocess: str | None = None,
         postprocess: str | None = None,
         threads: int = 1,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
     ) -> None:
         self.model = Path(model)
         self.classes = tuple(classes or categories)
@@ -83,7 +89,7 @@ class OnnxDetector:
         self.nms_iou = nms_iou
         self._preprocess = _import_function(preprocess) if preprocess else None
         self._postprocess = _import_function(postprocess) if postprocess else None
-        self._network = OnnxModel(self.model, threads, "detector")
+        self._network = OnnxModel(self.model, threads, "detector", providers, provider_options)
         if not self._preprocess:
             self._input, self._shape = self._find_input(points)
         self._names = {} if self._postprocess else self._find_outputs(outputs or {})

@@ -1,4 +1,4 @@
-"""ONNX models of the user in ONNX Runtime on the CPU."""
+"""ONNX models of the user in ONNX Runtime."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,8 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from curate.errors import ModelError, first_line
+from curate.errors import ModelError, error_prefix, first_line
 from curate.files.child_process import require_survival
+from curate.files.onnx_providers import (
+    AUTO,
+    ProviderOptions,
+    Providers,
+    open_session,
+    runtime_errors,
+)
 
 _LIBRARY = "onnxruntime"
 
@@ -35,13 +42,15 @@ class ModelValue:
 class OnnxModel:
     """An ONNX model that can be run.
 
-    Its file is loaded, and run for the first time, by a child process first: ONNX Runtime ends the
-    process on some damaged models.
+    Its file is loaded, and run for the first time, by a child process first, on the CPU: ONNX
+    Runtime ends the process on some damaged models.
 
     Args:
         path: the .onnx file.
-        threads: number of threads that ONNX Runtime uses for one operator.
+        threads: number of threads that ONNX Runtime uses for one operator on the CPU.
         section: the configuration section with the model's path, for error messages.
+        providers: where the model runs, see `curate.files.onnx_providers`.
+        provider_options: options of the providers.
 
     Attributes:
         path: the .onnx file.
@@ -50,19 +59,27 @@ class OnnxModel:
 
     Raises:
         ModelError: if the file is missing, or is not a usable ONNX model.
+        ConfigError: if a listed provider cannot be used.
     """
 
-    def __init__(self, path: Path, threads: int, section: str) -> None:
+    def __init__(
+        self,
+        path: Path,
+        threads: int,
+        section: str,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
+    ) -> None:
         if not path.is_file():
             raise ModelError(f"{path}: no such ONNX model; set {section}.path")
         self.path = path
-        require_survival(path, _LIBRARY, _open_session, error=ModelError)
-        load_errors: tuple[type[Exception], ...] = (*_runtime_errors(), RuntimeError, ValueError)
+        require_survival(path, _LIBRARY, open_session, error=ModelError)
         try:
-            self._session = _open_session(path, threads)
+            with error_prefix(f"{section}.providers"):
+                self._session = open_session(path, threads, providers, provider_options)
             self.inputs = _declared(self._session.get_inputs())
             self.outputs = _declared(self._session.get_outputs())
-        except load_errors as error:
+        except runtime_errors() as error:
             raise ModelError(f"{path}: not a usable ONNX model: {first_line(error)}") from error
 
     def run(
@@ -77,7 +94,7 @@ class OnnxModel:
         require_survival(self.path, _LIBRARY, _run_once, names, dict(inputs), error=ModelError)
         try:
             return dict(zip(names, self._session.run(names, dict(inputs)), strict=True))
-        except _runtime_errors() as error:
+        except runtime_errors() as error:
             raise ModelError(f"{self.path}: {first_line(error)}") from error
 
 
@@ -95,38 +112,6 @@ def _declared(values: Sequence[Any]) -> tuple[ModelValue, ...]:
     return tuple(ModelValue(value.name, value.type, tuple(value.shape or ())) for value in values)
 
 
-def _open_session(path: Path, threads: int = 1) -> Any:
-    """Return an `onnxruntime.InferenceSession`."""
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    # Spinning threads would take the cores from the other workers.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 4  # errors are raised, so they need not be logged too
-    # With the fallback enabled, it would print the error and try the same provider again.
-    return onnxruntime.InferenceSession(
-        str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
-    )
-
-
 def _run_once(path: Path, names: Sequence[str], inputs: Mapping[str, np.ndarray]) -> None:
     """Load a model and run it; called in a child process."""
-    _open_session(path).run(list(names), dict(inputs))
-
-
-def _runtime_errors() -> tuple[type[Exception], ...]:
-    """Return the error classes of ONNX Runtime; they have no common base class."""
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
-
-    return (
-        state.EPFail,
-        state.Fail,
-        state.InvalidArgument,
-        state.InvalidGraph,
-        state.InvalidProtobuf,
-        state.NoSuchFile,
-        state.NotImplemented,
-        state.RuntimeException,
-    )
+    open_session(path).run(list(names), dict(inputs))

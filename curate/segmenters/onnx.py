@@ -28,6 +28,7 @@ import numpy as np
 
 from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -49,7 +50,7 @@ _MAX_ASPECT_ERROR = 1.25
 
 
 class OnnxSegmenter:
-    """A `Segmenter` that runs an ONNX model on the CPU.
+    """A `Segmenter` that runs an ONNX model.
 
     Args:
         model: the .onnx file.
@@ -61,12 +62,15 @@ class OnnxSegmenter:
         output: name of the output with the map; not needed if there is one.
         channels: whether scores have their class axis "first" or "last"; not needed where only one
             of them leaves axes in the proportions of the input.
-        threads: number of threads of ONNX Runtime.
+        threads: number of threads of ONNX Runtime on the CPU.
+        providers: where the model runs: "auto", a provider such as "cuda", or several.
+        provider_options: options of ONNX Runtime's providers by their names.
 
     Raises:
         ModelError: if the file is missing or not an ONNX model, its input is not an image, or
             several outputs can be the map.
-        ConfigError: if an option or a class id is out of range.
+        ConfigError: if an option or a class id is out of range, or a listed provider cannot be
+            used.
     """
 
     needs_image = True
@@ -82,6 +86,8 @@ class OnnxSegmenter:
         output: str | None = None,
         channels: str | None = None,
         threads: int = 1,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
     ) -> None:
         if tiles < 1:
             raise ConfigError(f"segmenter.options.tiles {tiles}: expected at least 1")
@@ -89,7 +95,7 @@ class OnnxSegmenter:
             raise ConfigError(f"segmenter.options.channels {channels!r}: use first or last")
         self.classes = checked_classes(classes)
         self.tiles = tiles
-        self._model = ImageModel(Path(model), scaling, threads)
+        self._model = ImageModel(Path(model), scaling, threads, providers, provider_options)
         self._output = _map_output(self._model, output)
         self._channels = channels
 

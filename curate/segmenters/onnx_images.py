@@ -9,6 +9,7 @@ import numpy as np
 
 from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import ModelValue, OnnxModel
 from curate.frames import Frame
 
@@ -71,7 +72,9 @@ class ImageModel:
     Args:
         path: the .onnx file.
         scaling: a name in `SCALINGS`.
-        threads: number of threads of ONNX Runtime.
+        threads: number of threads of ONNX Runtime on the CPU.
+        providers: where the model runs, see `curate.files.onnx_providers`.
+        provider_options: options of the providers.
         single: whether an input without a batch axis, e.g. [3, height, width], is accepted too.
 
     Attributes:
@@ -79,18 +82,27 @@ class ImageModel:
         outputs: the declared outputs.
 
     Raises:
-        ConfigError: if there is no such scaling.
+        ConfigError: if there is no such scaling, or a listed provider cannot be used.
         ModelError: if the file is missing or not an ONNX model, or has another kind of input.
     """
 
-    def __init__(self, path: Path, scaling: str, threads: int, *, single: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        scaling: str,
+        threads: int,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
+        *,
+        single: bool = False,
+    ) -> None:
         if scaling not in SCALINGS:
             raise ConfigError(
                 f"segmenter.options.scaling {scaling!r}: use one of {', '.join(SCALINGS)}"
             )
         self.path = Path(path)
         self._scaling = scaling
-        self._model = OnnxModel(self.path, threads, "segmenter")
+        self._model = OnnxModel(self.path, threads, "segmenter", providers, provider_options)
         self.input = _image_input(self._model.inputs, self.path, single=single)
         self.outputs = self._model.outputs
 

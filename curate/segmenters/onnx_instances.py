@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -27,7 +28,7 @@ _GREY = 114
 
 
 class OnnxInstanceSegmenter:
-    """A `Segmenter` that runs an ONNX model of instance segmentation on the CPU.
+    """A `Segmenter` that runs an ONNX model of instance segmentation.
 
     Args:
         model: the .onnx file.
@@ -39,11 +40,14 @@ class OnnxInstanceSegmenter:
         mask_threshold: a pixel belongs to the object if its mask value is above this.
         scaling: how pixels are scaled for a float model: "imagenet", "unit" (0 to 1) or "none" (0
             to 255).
-        threads: number of threads of ONNX Runtime.
+        threads: number of threads of ONNX Runtime on the CPU.
+        providers: where the model runs: "auto", a provider such as "cuda", or several.
+        provider_options: options of ONNX Runtime's providers by their names.
 
     Raises:
         ModelError: if the file is missing or not an ONNX model, or its input is not an image.
-        ConfigError: if an option or a class id is out of range, or an output does not exist.
+        ConfigError: if an option or a class id is out of range, an output does not exist, or a
+            listed provider cannot be used.
     """
 
     needs_image = True
@@ -59,13 +63,17 @@ class OnnxInstanceSegmenter:
         mask_threshold: float = 0.5,
         scaling: str = "unit",
         threads: int = 1,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
     ) -> None:
         if not 0 <= minimum_score <= 1:
             raise ConfigError(f"segmenter.options.minimum_score {minimum_score}: expected 0 to 1")
         self.classes = checked_classes(classes)
         self.minimum_score = minimum_score
         self.mask_threshold = mask_threshold
-        self._model = ImageModel(Path(model), scaling, threads, single=True)
+        self._model = ImageModel(
+            Path(model), scaling, threads, providers, provider_options, single=True
+        )
         self._outputs = self._check_outputs(dict(outputs or _OUTPUTS))
 
     def segment(self, frame: Frame) -> SemanticMap:

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from curate.detectors.base import Student, TrainableDetector, choose_preset
-from curate.errors import ConfigError, first_line
+from curate.detectors.devices import check_device
+from curate.errors import ConfigError
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.training.batches import Batches
@@ -204,10 +205,6 @@ def _first_student(
             f"{start}: has preset {student.preset} and categories {', '.join(student.categories)}; "
             f"the training needs {settings.preset} and {', '.join(categories)}"
         )
-    try:
-        student.network.to(settings.device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(
-            f"device {settings.device!r} cannot be used: {first_line(error)}"
-        ) from None
+    check_device(settings.device)
+    student.network.to(settings.device)
     return student

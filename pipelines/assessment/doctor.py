@@ -18,9 +18,16 @@ from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.geometry.augmented_views import augmented_frame
 from curate.segmenters.base import Segmenter, image_size_of
-from pipelines.assembly import open_detector, open_segmenter, wants_views
+from pipelines.assembly import (
+    check_detector,
+    check_segmenter,
+    open_detector,
+    open_segmenter,
+    wants_views,
+)
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
+from pipelines.devices import detector_place, idle_gpu, segmenter_place
 from pipelines.engine.rounds import choose_round, newest_checkpoint
 from pipelines.labels.of_one_frame import find_frame
 from pipelines.stages.predict import checked, visible
@@ -55,7 +62,8 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
         frame = workspace.dataset.read(name, image=semantic)
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
-    findings = [*_names(find_differences(workspace)), *examine_frame(frame)]
+    findings = [*_guarded("devices", lambda: _devices(workspace.config, semantic=semantic))]
+    findings += [*_names(find_differences(workspace)), *examine_frame(frame)]
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
@@ -83,6 +91,20 @@ def report_wrong_inputs(workspace: Workspace) -> None:
     for finding in findings:
         if finding.state == "wrong":
             _log.warning("%s: %s; see `curate doctor`", finding.check, finding.message)
+
+
+def _devices(config: Config, *, semantic: bool) -> Sequence[Finding]:
+    """Report where the models run."""
+    check_detector(config)
+    if semantic:
+        check_segmenter(config)
+    places = {"detector": detector_place(config)}
+    if semantic:
+        places["segmenter"] = segmenter_place(config)
+    used = "; ".join(f"{model} in {place}" for model, place in places.items() if place)
+    if idle_gpu(*places.values()):
+        used += "; the NVIDIA GPU of this machine is not used, see docs/install.md#gpus"
+    return [Finding("devices", "ok", used or "no model runs here")]
 
 
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:

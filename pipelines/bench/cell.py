@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import curate
+from curate.detectors.devices import choose_device
 from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_rules import relaxed
-from pipelines.assembly import device
 from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
 from pipelines.bench.grid import Job, looks_at_unlabeled
@@ -181,6 +181,6 @@ def _about(workspace: Workspace) -> dict[str, str]:
     """Return versions and device, on which the figures may depend."""
     import torch
 
-    on = device(workspace.config)
+    on = choose_device(workspace.config.detector.device)
     name = torch.cuda.get_device_name() if on == "cuda" else f"{os.cpu_count()} CPU cores"
     return {"curate": curate.__version__, "torch": torch.__version__, "device": name}

@@ -10,6 +10,7 @@ import numpy as np
 from curate.category_names import renamed
 from curate.detections import Detections
 from curate.detectors.base import BatchDetector, Detector, NamesCategories
+from curate.detectors.devices import AUTO
 from curate.errors import CurateError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
@@ -23,6 +24,9 @@ from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
 Item = TypeVar("Item")
+
+# Settings of detectors and segmenters that change no result, or are stored with it by themselves.
+_WITHOUT_EFFECT = ("path", "augmented", "batch_size", "providers")
 
 
 @dataclass
@@ -188,18 +192,22 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     """Return what predictions depend on besides the frames and the teacher."""
     config = workspace.config
     return {
-        "detector": config.detector.model_dump(
-            mode="json",
-            exclude={"path", "augmented", "batch_size", *unset_rename(config.detector)},
-        ),
+        "detector": settings_of_results(config.detector),
         "files": option_files(config),
         "categories": config.dataset.categories,
     }
 
 
-def unset_rename(section: DetectorSection | SegmenterSection) -> tuple[str, ...]:
-    """Return the key of `rename` if it is unset: results from before the setting stay valid."""
-    return ("rename",) if section.rename is None else ()
+def settings_of_results(section: DetectorSection | SegmenterSection) -> Settings:
+    """Return the settings of a section that its results depend on.
+
+    Where a model runs is not among them: results of another device or provider differ by rounding,
+    and count as the same. Options of providers are, because they can lower the precision. A newer
+    setting is left out while it is unset, so that results from before it stay valid.
+    """
+    unset = {name for name in ("rename", "provider_options") if not getattr(section, name)}
+    found = section.model_dump(mode="json", exclude={*_WITHOUT_EFFECT, *unset})
+    return {**found, "device": AUTO} if "device" in found else found
 
 
 def option_files(config: Config) -> dict[str, str]:

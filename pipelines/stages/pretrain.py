@@ -6,6 +6,7 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 
 from curate.category_names import listed
+from curate.detectors.devices import AUTO
 from curate.errors import ConfigError, WorkspaceError
 from db import bulk
 from pipelines.assembly import trained_detector
@@ -45,7 +46,7 @@ def settings(workspace: Workspace) -> Any:
         config.train.model_dump(mode="json", exclude=_LATER_SETTINGS) | {"preset": trained.preset},
         sorted(labeled),
         config.run.seed,
-        config.detector.device,
+        AUTO,  # the device: a teacher is kept, wherever it was trained
         config.dataset.categories,
         config.detector.name,
         trained.detector.checkpoint_version,

@@ -36,7 +36,7 @@ from pipelines.engine.stage import (
 )
 from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
-from pipelines.stages.predict import unset_rename
+from pipelines.stages.predict import settings_of_results
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
@@ -209,8 +209,7 @@ def _measured_settings(source: Source, workspace: Workspace, _context: RoundCont
     if not PRIORS.takes(name, "segmenter"):
         return options
     path = segmenter_path(config)
-    exclude = {"path", *unset_rename(config.segmenter)}
-    segmenter = config.segmenter.model_dump(mode="json", exclude=exclude)
+    segmenter = settings_of_results(config.segmenter)
     return {**options, "segmenter": segmenter, "model": _identity(path)}
 
 

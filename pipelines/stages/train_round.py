@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection
 
+from curate.detectors.devices import AUTO, choose_device
 from curate.errors import ConfigError, one_line
 from curate.frames import Frame
 from curate.spelling import did_you_mean
@@ -15,7 +16,6 @@ from db import bulk
 from pipelines.assembly import (
     check_labels_format,
     check_policy,
-    device,
     trainable_detector,
     trained_detector,
 )
@@ -57,7 +57,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
         "zero_weight": zero_weight_of(workspace.config, policy),
         "ema_decay": section.ema_decay if method.teacher == "ema" else None,
         "seed": context.seed,
-        "device": workspace.config.detector.device,
+        "device": AUTO,  # a student is kept, wherever it was trained
         "detector": workspace.config.detector.name,
         "checkpoint": trainable and trainable.detector.checkpoint_version,
     }
@@ -194,7 +194,7 @@ def training_settings(
         "ema_decay": section.ema_decay,
         "statistics_steps": section.statistics_steps,
         "seed": workspace.config.run.seed + round_number,
-        "device": device(workspace.config),
+        "device": choose_device(workspace.config.detector.device),
     }
     try:
         return TrainingSettings(**{**values, **section.options})

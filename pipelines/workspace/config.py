@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -28,7 +29,7 @@ from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
-from pipelines.workspace.names import KnownClassSet, KnownName
+from pipelines.workspace.names import KnownClassSet, KnownDevice, KnownName, KnownProvider
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -48,6 +49,7 @@ PriorName = Annotated[str, KnownName(registry.PRIORS)]
 PolicyName = Annotated[str, KnownName(registry.POLICIES)]
 ExporterName = Annotated[str, KnownName(registry.EXPORTERS)]
 ExecutorName = Annotated[str, KnownName(registry.EXECUTORS)]
+ProviderName = Annotated[str, KnownProvider()]
 
 DEFAULT_PRIORS = ("points", "semantic")
 
@@ -92,6 +94,18 @@ def _own_rename(section: Any, key: str, name: str) -> Any:
         raise ValueError("both rename and options.rename are set; remove options.rename")
     kept = {each: value for each, value in options.items() if each != "rename"}
     return {**section, "options": kept, "rename": options["rename"]}
+
+
+def _as_list(names: Any) -> Any:
+    """Return a single name as a list of one."""
+    return (names,) if isinstance(names, str) and names != "auto" else names
+
+
+ProviderNames = Annotated[
+    Annotated[tuple[ProviderName, ...], Field(min_length=1), AfterValidator(_each_once)]
+    | Literal["auto"],
+    BeforeValidator(_as_list),
+]
 
 
 def _falling(numbers: tuple[int, ...]) -> tuple[int, ...]:
@@ -192,9 +206,19 @@ class DetectorSection(Section):
         "workspace.",
         examples=["copies/round-{round}"],
     )
-    device: Literal["auto", "cpu", "cuda"] = Field(
+    device: Annotated[str, KnownDevice()] = Field(
         default="auto",
-        description="Where the detector runs and trains. 'auto' uses a GPU if there is one.",
+        description="Where the detector runs and trains: 'cpu', or a device of torch such as "
+        "'cuda', 'cuda:1', 'mps' or 'xpu'. 'auto' uses such a device if there is one.",
+    )
+    providers: ProviderNames = Field(
+        default="auto",
+        description="Execution providers of ONNX Runtime for a detector in ONNX, the preferred one "
+        "first; each must work. 'auto' takes one that fits the device; see docs/detectors.md.",
+    )
+    provider_options: dict[ProviderName, Options] = Field(
+        default={},
+        description="Options of the providers by their names, such as {cuda = {device_id = 1}}.",
     )
     minimum_score: Share = Field(
         default=0.1,
@@ -245,6 +269,16 @@ class SegmenterSection(Section):
         description="Class set that gives the segmenter's class ids their meaning; see "
         "docs/segmenters.md.",
         examples=["cityscapes"],
+    )
+    providers: ProviderNames = Field(
+        default="auto",
+        description="Execution providers of ONNX Runtime for a segmenter in ONNX, the preferred "
+        "one first; each must work. 'auto' takes the best one that is installed and works; see "
+        "docs/segmenters.md.",
+    )
+    provider_options: dict[ProviderName, Options] = Field(
+        default={},
+        description="Options of the providers by their names, such as {cuda = {device_id = 1}}.",
     )
     rename: Rename = Field(
         default=None,

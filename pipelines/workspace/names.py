@@ -6,7 +6,9 @@ from typing import Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
+from curate.detectors.devices import check_device_name
 from curate.errors import ConfigError
+from curate.files.onnx_providers import PROVIDERS, provider_named
 from pipelines.registry import Registry
 
 
@@ -81,3 +83,32 @@ class KnownClassSet(_CheckedText):
         from curate.segmenters.classes import class_map
 
         class_map(name)
+
+
+@dataclass(frozen=True)
+class KnownProvider(_CheckedText):
+    """Marks a text as the name of an execution provider of ONNX Runtime."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the known providers; ONNX Runtime's own names are valid, too."""
+        return tuple(each.name for each in PROVIDERS)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        choices = [{"enum": list(self.names)}, {"pattern": "^[A-Za-z]+ExecutionProvider$"}]
+        return {**handler(schema), "anyOf": choices}
+
+    def check(self, name: str) -> None:
+        """Raise ConfigError if the name is not valid."""
+        provider_named(name)
+
+
+@dataclass(frozen=True)
+class KnownDevice(_CheckedText):
+    """Marks a text as the name of a device of torch, or "auto"."""
+
+    def check(self, name: str) -> None:
+        """Raise ConfigError if the name is not valid."""
+        check_device_name(name)

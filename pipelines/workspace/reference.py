@@ -11,9 +11,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from curate.files.toml_text import toml
-from pipelines.workspace.names import KnownClassSet, KnownName
+from pipelines.workspace.names import KnownClassSet, KnownName, KnownProvider
 
 _TYPES = {bool: "true or false", int: "whole number", float: "number", str: "string", Path: "path"}
+_NAMED = KnownName | KnownClassSet | KnownProvider  # they know the valid names
 _COUNTS = {2: "two", 3: "three"}
 
 
@@ -40,7 +41,8 @@ class Accepted:
         if self.choices:
             more = " or module:Class" if self.open else ""
             kind = "a list of " if self.type.startswith("list") else "one of "
-            return f"{kind}{', '.join(self.choices)}{more}"
+            value = f"{kind}{', '.join(self.choices)}{more}"
+            return ", or ".join((value, *(f'"{word}"' for word in self.words)))
         article = "" if self.type == _TYPES[bool] else "a "
         comma = "" if not self.range or self.range.startswith("from") else ","
         value = f"{article}{self.type}{comma} {self.range}".rstrip()
@@ -118,7 +120,7 @@ def _accepted(annotation: Any, metadata: Sequence[Any] = ()) -> Accepted:
         return Accepted("string", choices=arguments)
     if origin is tuple:
         return _accepted_list(arguments)
-    named = [each for each in metadata if isinstance(each, KnownName | KnownClassSet)]
+    named = [each for each in metadata if isinstance(each, _NAMED)]
     if named:
         return Accepted("string", choices=named[0].names, open=isinstance(named[0], KnownName))
     kind = "table" if origin is dict else _TYPES.get(annotation, "value")

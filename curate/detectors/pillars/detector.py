@@ -1,13 +1,14 @@
-"""The trained pillar detector: runs in ONNX Runtime on CPU and in torch on a GPU."""
+"""The trained pillar detector: runs in ONNX Runtime on the CPU and in torch on a GPU."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from curate.detections import Detections
+from curate.detectors.devices import check_device
 from curate.detectors.pillars.checkpoint import (
     FORMAT_VERSION,
     GRAPH_DIGEST,
@@ -19,7 +20,16 @@ from curate.detectors.pillars.checkpoint import (
 )
 from curate.detectors.pillars.encoding import Pillars, decode, encode_points
 from curate.detectors.pillars.presets import PRESETS
-from curate.errors import ConfigError, ModelError, first_line
+from curate.errors import ModelError
+from curate.files.onnx_providers import (
+    AUTO,
+    CPU,
+    ProviderOptions,
+    Providers,
+    listed_providers,
+    open_session,
+    runtime_errors,
+)
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
@@ -37,14 +47,16 @@ class PillarDetector:
 
     Args:
         checkpoint: the safetensors file.
-        device: "cpu", or a torch device such as "cuda".
+        device: "cpu" for ONNX Runtime, or a device of torch such as "cuda".
         minimum_score: boxes with a lower score are left out.
         nms_iou: BEV IoU above which the higher-scored box of a category suppresses the other.
-        threads: number of threads of the network, on CPU.
+        threads: number of threads of the network, on the CPU.
+        providers: providers of ONNX Runtime to use in place of the device; "auto" for none.
+        provider_options: options of the providers by their names.
 
     Raises:
         ModelError: if the checkpoint is missing, damaged, or of another detector or version.
-        ConfigError: if the device cannot be used.
+        ConfigError: if the device or a provider cannot be used.
     """
 
     presets: ClassVar[Collection[str]] = PRESETS.keys()
@@ -59,14 +71,16 @@ class PillarDetector:
         minimum_score: float = 0.1,
         nms_iou: float = 0.1,
         threads: int = 1,
+        providers: Providers = AUTO,
+        provider_options: ProviderOptions | None = None,
     ) -> None:
         checkpoint = Path(checkpoint)
         self._checkpoint = load_checkpoint(checkpoint)
         self._minimum_score = minimum_score
         self._nms_iou = nms_iou
         self._forward = (
-            onnx_forward(checkpoint, self._checkpoint, threads)
-            if device == "cpu"
+            onnx_forward(checkpoint, self._checkpoint, threads, providers, provider_options)
+            if device == "cpu" or listed_providers(providers)
             else torch_forward(checkpoint, self._checkpoint, device)
         )
 
@@ -117,39 +131,31 @@ class PillarDetector:
 
 
 def onnx_forward(
-    path: Path, checkpoint: Checkpoint, threads: int
+    path: Path,
+    checkpoint: Checkpoint,
+    threads: int,
+    providers: Providers = AUTO,
+    options: ProviderOptions | None = None,
 ) -> Callable[[Pillars], FrameOutput]:
-    """Return a function that runs the checkpoint's ONNX graph in ONNX Runtime, on CPU.
+    """Return a function that runs the checkpoint's ONNX graph in ONNX Runtime.
 
-    Builds the graph first if it is missing or belongs to another checkpoint.
+    Builds the graph first if it is missing or belongs to another checkpoint. Without a list of
+    providers it runs on the CPU.
     """
-    import onnxruntime
-    from onnxruntime.capi.onnxruntime_pybind11_state import (
-        Fail,
-        InvalidGraph,
-        InvalidProtobuf,
-        NoSuchFile,
-    )
+    listed = [each.name for each in listed_providers(providers)] or CPU.name
 
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-
-    def open_session() -> onnxruntime.InferenceSession:
-        return onnxruntime.InferenceSession(
-            str(graph_path(path)), options, providers=["CPUExecutionProvider"]
-        )
+    def open_graph() -> Any:
+        return open_session(graph_path(path), threads, listed, options)
 
     digest = digest_of(path)
     try:
-        session = open_session()
+        session = open_graph()
         outdated = session.get_modelmeta().custom_metadata_map.get(GRAPH_DIGEST) != digest
-    except (Fail, InvalidGraph, InvalidProtobuf, NoSuchFile):
+    except runtime_errors():
         outdated = True
     if outdated:
         write_graph(path, checkpoint, digest)
-        session = open_session()
+        session = open_graph()
 
     def forward(pillars: Pillars) -> FrameOutput:
         inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
@@ -167,11 +173,10 @@ def torch_forward(
 
     from curate.detectors.pillars.network import SingleFrame, network_of
 
+    check_device(device)
+    torch_device = torch.device(device)
     try:
-        torch_device = torch.device(device)
         network = SingleFrame(network_of(checkpoint)).eval().to(torch_device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device {device!r} cannot be used: {first_line(error)}") from None
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 

@@ -1,0 +1,162 @@
+"""Where models run: device and providers of the configuration, on machines that are not here."""
+
+import pytest
+import torch
+from support.fake_providers import FakeRuntime, fake_providers
+from support.pipelines_cli import Curate
+from support.tiny_onnx import tiny_detector
+
+from curate.detectors.devices import check_device_name, choose_device
+from curate.errors import ConfigError
+from pipelines.assembly import check_detector, check_segmenter, open_detector
+from pipelines.devices import Place, detector_place, idle_gpu, segmenter_place
+from pipelines.stages.predict import settings_of_results
+from pipelines.workspace.config import make_config
+
+
+def config(**sections):
+    """Return a configuration with these sections."""
+    return make_config({"dataset": {"root": "."}, **sections}, "test")
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """Pretend that torch has been built for CUDA and finds a GPU."""
+    monkeypatch.setattr("curate.detectors.devices.version", lambda name: "2.13.0+cu128")
+    monkeypatch.setattr(torch.accelerator, "is_available", lambda: True)
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda: torch.device("cuda"))
+
+
+@pytest.mark.parametrize(
+    ("detector", "without", "with_gpu"),
+    [
+        ({}, Place(providers="cpu"), Place("cuda")),
+        ({"device": "cpu"}, Place(providers="cpu"), Place(providers="cpu")),
+        ({"device": "cuda:1"}, Place("cuda:1"), Place("cuda:1")),
+        ({"providers": "cuda"}, Place(providers=("cuda",)), Place(providers=("cuda",))),
+        ({"name": "onnx"}, Place(), Place()),
+        ({"name": "onnx", "device": "cpu"}, Place(providers="cpu"), Place(providers="cpu")),
+        ({"name": "recorded", "device": "cpu"}, None, None),
+        ({"name": "support.fake_providers:DetectorInTorch"}, Place("cpu"), Place("cuda")),
+    ],
+)
+def test_one_rule_for_torch_and_onnx_runtime(detector, without, with_gpu, request):
+    """Pillars runs in torch on a GPU, in ONNX Runtime on the CPU and on listed providers."""
+    assert detector_place(config(detector=detector)) == without
+    request.getfixturevalue("gpu")
+    assert detector_place(config(detector=detector)) == with_gpu
+
+
+def test_the_device_chooses_the_provider_of_a_model_in_onnx(monkeypatch):
+    """With its number as an option."""
+    fake_providers(monkeypatch, FakeRuntime(("CUDA",)))
+    found = detector_place(config(detector={"name": "onnx", "device": "cuda:1"}))
+    assert found == Place(None, ("cuda",), {"cuda": {"device_id": 1}})
+    assert found.exclusive
+    check_detector(config(detector={"name": "onnx", "device": "cuda:1", "path": "a.onnx"}))
+
+
+def test_the_torch_library_is_not_imported_where_it_has_no_gpu(monkeypatch):
+    """Its CPU build has none; importing it would take a second and 200 MB in each worker."""
+    monkeypatch.setattr("curate.detectors.devices.version", lambda name: "2.13.0+cpu")
+    monkeypatch.setattr(torch, "accelerator", None)
+    assert choose_device("auto") == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"detector": {"providers": "cdua"}}, "detector.providers: unknown provider 'cdua'.*cuda'"),
+        ({"segmenter": {"providers": ["cuda", "cuda"]}}, "segmenter.providers: 'cuda' is listed "),
+        ({"segmenter": {"providers": []}}, "segmenter.providers: .* use a list of cuda, .*auto"),
+        ({"detector": {"provider_options": {"cud": {}}}}, "provider_options.*did you mean 'cuda'"),
+        ({"detector": {"device": "gpu"}}, "detector.device: unknown device 'gpu': .*'cuda'"),
+        ({"detector": {"device": "cudda:1"}}, "unknown device 'cudda:1'.*did you mean 'cuda'"),
+        ({"detector": {"device": "auto:1"}}, "unknown device 'auto:1'"),
+    ],
+)  # fmt: skip
+def test_wrong_names_are_rejected_when_the_configuration_is_read(sections, message):
+    """One line, with what was meant."""
+    with pytest.raises(ConfigError, match=message):
+        config(**sections)
+
+
+@pytest.mark.parametrize("name", ["auto", "cpu", "cuda", "cuda:3", "mps", "xpu:0", "npu", "hpu"])
+def test_any_device_of_torch_can_be_named(name):
+    check_device_name(name)
+
+
+@pytest.mark.parametrize(
+    ("detector", "message"),
+    [
+        ({"device": "cuda:99"}, "detector.device: device 'cuda:99' cannot be used by torch"),
+        ({"device": "npu"}, "detector.device: device 'npu' cannot be used by torch"),
+        ({"name": "recorded", "providers": "cpu"}, "detector.providers: .* not run in ONNX Runt"),
+        ({"providers": "cuda"}, "detector.providers: provider 'cuda' is not in the installed"),
+        ({"name": "onnx", "device": "cuda"}, "detector.device: provider 'cuda' is not in the inst"),
+        ({"name": "onnx", "device": "hpu"}, "detector.device: ONNX Runtime has no provider for d"),
+    ],
+)  # fmt: skip
+def test_what_is_not_there_is_an_error_before_the_first_frame(detector, message, tmp_path):
+    """Without a listed device or provider nothing is an error: the CPU is always there."""
+    section = {"path": str(tmp_path), **detector}
+    with pytest.raises(ConfigError, match=message):
+        check_detector(config(detector=section))
+    kept = {key: value for key, value in section.items() if key in {"name", "path"}}
+    check_detector(config(detector=kept))
+
+
+def test_a_segmenter_without_a_model_rejects_providers():
+    """Saved maps run nowhere."""
+    saved = {"name": "saved", "path": "maps", "classes": "voc"}
+    check_segmenter(config(segmenter=saved))
+    with pytest.raises(ConfigError, match=r"segmenter\.providers: .* remove the setting"):
+        check_segmenter(config(segmenter={**saved, "providers": ["cpu"]}))
+
+
+def test_providers_and_their_options_reach_the_model(monkeypatch, tmp_path):
+    """From the configuration to the session."""
+    runtime = fake_providers(monkeypatch, FakeRuntime(("CUDA",)))
+    tiny_detector(tmp_path / "a.onnx")
+    section = {"name": "onnx", "path": str(tmp_path / "a.onnx"), "providers": ["cuda"]}
+    section["provider_options"] = {"cuda": {"device_id": 1}}
+    open_detector(config(detector=section), tmp_path / "a.onnx")
+    assert runtime.opened == [{"CUDA": {"use_tf32": 0, "device_id": 1}}]
+
+
+def test_results_of_another_device_or_provider_stay_valid():
+    """Options of providers may lower the precision, so they count."""
+    first = settings_of_results(config().detector)
+    for same in ({"device": "cpu"}, {"device": "cuda"}, {"providers": ["cuda"]}):
+        assert settings_of_results(config(detector=same).detector) == first
+    other = {"provider_options": {"tensorrt": {"trt_fp16_enable": True}}}
+    assert settings_of_results(config(detector=other).detector) != first
+    assert not {"providers", "provider_options"} & first.keys()
+
+
+def test_an_idle_gpu_is_noticed(monkeypatch):
+    """Where NVIDIA's tools are installed, and no model runs on a device of its own."""
+    monkeypatch.setattr("pipelines.devices.shutil.which", lambda name: f"/usr/bin/{name}")
+    assert idle_gpu(Place(providers="cpu"), None)
+    assert not idle_gpu(Place("cuda"), Place(providers="cpu"))
+    assert not idle_gpu(None, None)
+    monkeypatch.setattr("pipelines.devices.shutil.which", lambda name: None)
+    assert not idle_gpu(Place(providers="cpu"))
+
+
+def test_the_segmenter_that_is_shipped_runs_in_onnx_runtime():
+    assert segmenter_place(config(segmenter={"name": "simulated"})) == Place()
+    assert segmenter_place(config()) is None
+
+
+def test_doctor_says_where_models_run(curate: Curate, tmp_path, toy_kitti, monkeypatch):
+    """And which providers follow if the first one fails."""
+    fake_providers(monkeypatch, FakeRuntime(("CUDA",)))
+    tiny_detector(tmp_path / "a.onnx")
+    code, _, err = curate(
+        "init", tmp_path / "w", "--root", toy_kitti, "--labeled", "0.25", "--detector", "onnx",
+        "--detector-path", tmp_path / "a.onnx", "--set", 'run.priors=["points"]',
+    )  # fmt: skip
+    assert code == 0, err
+    _, out, _ = curate("doctor", "-w", tmp_path / "w")
+    assert "ok       devices      detector in ONNX Runtime on cuda, or cpu" in out
