@@ -118,6 +118,7 @@ def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
         "calibration": lambda: _calibrations(config),
         "wants_views": lambda: wants_views(config),
         "device": lambda: place().device or CPU.name,
+        "precision": lambda: config.detector.precision,
         "providers": lambda: place().providers,
         "provider_options": lambda: place().options,
     }

@@ -9,8 +9,10 @@
 
 import shutil
 from dataclasses import dataclass, field
+from functools import partial
 
 from curate.detectors.devices import AUTO, check_device, choose_device
+from curate.detectors.precision import FLOAT32, mixed_precision
 from curate.errors import ConfigError, error_prefix
 from curate.files.onnx_providers import (
     CPU,
@@ -71,10 +73,11 @@ def detector_place(config: Config) -> Place | None:
         return Place(providers=section.providers, options=section.provider_options)
     if in_torch:
         device = choose_device(section.device)
-        in_runtime = in_runtime and device == CPU.name
+        in_runtime = in_runtime and device == CPU.name and section.precision == FLOAT32
         return Place(providers=CPU.name) if in_runtime else Place(device)
     if in_runtime:
-        return Place(None, *providers_of_device(section.device, section.provider_options))
+        with error_prefix("detector.device"):
+            return Place(None, *providers_of_device(section.device, section.provider_options))
     return None
 
 
@@ -94,12 +97,22 @@ def check_detector_place(config: Config) -> None:
         ConfigError: if the device or a listed provider cannot be used, or has no effect.
     """
     section = config.detector
-    if registry.DETECTORS.takes(section.name, "device"):
+    takes = partial(registry.DETECTORS.takes, section.name)
+    if takes("device"):
         with error_prefix("detector.device"):
             check_device(section.device)
+    place = detector_place(config)
+    if section.precision != FLOAT32:
+        if place is None or place.device is None or not takes("precision"):
+            raise ConfigError(
+                "detector.precision: only pillars and classes with this argument, in torch, have a "
+                "mixed precision; remove the setting"
+            )
+        with error_prefix("detector.precision"):
+            mixed_precision(section.precision, place.device)
     setting = "device" if section.providers == AUTO else "providers"
     with error_prefix(f"detector.{setting}"):
-        _check_providers(detector_place(config), section.providers)
+        _check_providers(place, section.providers)
 
 
 def check_segmenter_place(config: Config) -> None:

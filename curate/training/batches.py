@@ -1,5 +1,8 @@
 """Batches of a training: the augmented frames of each step."""
 
+import copy
+from typing import Self
+
 import numpy as np
 
 from curate.detectors.base import Sample
@@ -45,6 +48,12 @@ class Batches:
             generator = np.random.default_rng([self._settings.seed, step, position])
             augmented.append(self._augmentation.apply(self._sample(index), self.bank, generator))
         return augmented
+
+    def for_loader(self, loaders: int) -> Self:
+        """Return the same batches for one of several loaders: its cache is empty and smaller."""
+        own = copy.copy(self)
+        vars(own).update(_cache={}, _free_cache_bytes=self._settings.cache_bytes // loaders)
+        return own
 
     def frame_indices(self, step: int) -> list[int]:
         """Return the indices of the frames of a step, in X_l and then in X_u.

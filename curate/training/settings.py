@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+from curate.detectors.precision import FLOAT32, Precision
 from curate.errors import ConfigError
 from curate.training.augmentation import Augmentation
 
@@ -29,7 +30,12 @@ class TrainingSettings:
         fewest_points: see `Augmentation`; applies to the objects of the bank too.
         seed: seed of the initial weights, the order of the frames and the augmentation.
         threads: number of torch threads, on CPU.
+        loaders: number of processes that prepare the batches ahead; 0 for none. It does not change
+            the result. The processes are started with `multiprocessing`, so a script calls the
+            training below `if __name__ == "__main__":`.
         device: "cpu", or a torch device such as "cuda".
+        precision: type of numbers in which the network computes on the device: "float32",
+            "bfloat16" or "float16" (with a scaled loss); weights and loss stay float32.
         teacher: the network that is saved: the "student", or the moving average of its weights,
             "ema".
         ema_decay: see `MovingAverage`.
@@ -50,7 +56,9 @@ class TrainingSettings:
     fewest_points: int = 5
     seed: int = 0
     threads: int = 1
+    loaders: int = 0
     device: str = "cpu"
+    precision: Precision = FLOAT32
     teacher: Teacher = "student"
     ema_decay: float = 0.999
     cache_bytes: int = 1 << 30
@@ -62,6 +70,7 @@ class TrainingSettings:
         for name, lowest in (
             ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
             ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
+            ("loaders", 0),
         ):  # fmt: skip
             if getattr(self, name) < lowest:
                 raise ConfigError(
@@ -77,6 +86,9 @@ class TrainingSettings:
             raise ConfigError(
                 f"training: ema_decay is {self.ema_decay}, must be at least 0 and below 1"
             )
+        if self.precision not in get_args(Precision):
+            choices = ", ".join(get_args(Precision))
+            raise ConfigError(f"training: unknown precision {self.precision!r}; choose {choices}")
         if self.teacher not in get_args(Teacher):
             choices = " or ".join(get_args(Teacher))
             raise ConfigError(f"training: unknown teacher {self.teacher!r}; choose {choices}")

@@ -19,7 +19,7 @@ from curate.training.settings import TrainingSettings
 _log = logging.getLogger(__name__)
 
 # Settings that do not change the result.
-_WITHOUT_EFFECT = ("cache_bytes", "snapshot_seconds", "statistics_steps")
+_WITHOUT_EFFECT = ("cache_bytes", "loaders", "snapshot_seconds", "statistics_steps")
 
 
 def fingerprint(

@@ -14,11 +14,13 @@ import torch
 
 from curate.detectors.base import Student, TrainableDetector, choose_preset
 from curate.detectors.devices import check_device
+from curate.detectors.precision import mixed_precision
 from curate.errors import ConfigError
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
+from curate.training.loading import encoder_of, load_batches
 from curate.training.moving_average import MovingAverage
 from curate.training.settings import Statistic, TrainingReport, TrainingSettings
 from curate.training.snapshot import fingerprint, load_snapshot, save_snapshot, snapshot_path
@@ -68,7 +70,9 @@ def train(
         LeakageError: if the label file contains ground truth of unlabeled frames.
         ModelError: if the start checkpoint cannot be used.
         ConfigError: if the start checkpoint has another preset or other categories, the detector
-            has no such preset or its student lacks a member, or the device cannot be used.
+            has no such preset or its student lacks a member, or the device or the precision cannot
+            be used.
+        CurateError: if a process that prepares batches is killed.
     """
     began = time.monotonic()
     labels, output = Path(labels), Path(output)
@@ -77,7 +81,9 @@ def train(
     settings = replace(settings, preset=choose_preset(detector, settings.preset))
     samples = WeightedLabels(labels, read=read)
     student = _first_student(detector, settings, samples.categories, start)
-    network = student.network
+    encoder = encoder_of(student, settings)
+    check_device(settings.device)
+    network = student.network.to(settings.device)
     batches = Batches(samples, settings)
     for category, objects in batches.bank.objects.items():
         if not objects:
@@ -85,17 +91,25 @@ def train(
     optimizer = torch.optim.AdamW(
         network.parameters(), weight_decay=_WEIGHT_DECAY, betas=(0.9, 0.99)
     )
+    scaler = torch.amp.GradScaler(
+        torch.device(settings.device).type, enabled=settings.precision == "float16"
+    )
     mark = fingerprint(detector, labels, settings, start)
     average = _average_of(network, settings)
     networks = [network, average.network] if average else [network]
-    initial: dict[str, Any] = {"step": 0, "losses": [], "statistics": []}
+    initial: dict[str, Any] = {"step": 0, "losses": [], "statistics": [], "scaler": {}}
     state = load_snapshot(output, mark, networks, optimizer) or initial
     resumed_at, losses = state["step"], state["losses"]
     statistics = [Statistic(*each) for each in state["statistics"]]
+    if state["scaler"]:
+        scaler.load_state_dict(state["scaler"])
     saved = time.monotonic()
     network.train()
-    for step in range(resumed_at, settings.steps):
-        values = _train_step(student, optimizer, batches, step, settings)
+    steps = range(resumed_at, settings.steps)
+    expected = settings.batch_size * batches.objects_per_frame
+    loaded = load_batches(encoder, batches, steps, settings)
+    for step, batch in zip(steps, loaded, strict=True):
+        values = _train_step(student, optimizer, scaler, batch, expected, step, settings)
         losses = [*losses[1 - _RECENT_STEPS :], float(values["loss"])]
         if (step + 1) % settings.statistics_steps == 0 or step + 1 == settings.steps:
             statistics += [
@@ -110,6 +124,7 @@ def train(
                 "step": step + 1,
                 "losses": losses,
                 "statistics": list(map(astuple, statistics)),
+                "scaler": scaler.state_dict(),
             }
             save_snapshot(output, mark, networks, optimizer, state)
             saved = time.monotonic()
@@ -147,7 +162,9 @@ def _average_of(network: torch.nn.Module, settings: TrainingSettings) -> MovingA
 def _train_step(
     student: Student,
     optimizer: torch.optim.Optimizer,
-    batches: Batches,
+    scaler: torch.amp.GradScaler,
+    batch: Any,
+    expected: float,
     step: int,
     settings: TrainingSettings,
 ) -> dict[str, float | torch.Tensor]:
@@ -155,14 +172,17 @@ def _train_step(
     rate = one_cycle(step, settings.steps, settings.learning_rate)
     for group in optimizer.param_groups:
         group["lr"] = rate
-    batch = student.encode(batches[step], settings.device)
-    expected = settings.batch_size * batches.objects_per_frame
-    with _torch_seeded([settings.seed, step], settings.device):
+    with (
+        _torch_seeded([settings.seed, step], settings.device),
+        mixed_precision(settings.precision, settings.device),
+    ):
         terms = student.loss(batch, expected)
     optimizer.zero_grad(set_to_none=True)
-    torch.autograd.backward(terms["loss"])
+    torch.autograd.backward(scaler.scale(terms["loss"]))
+    scaler.unscale_(optimizer)
     norm = torch.nn.utils.clip_grad_norm_(student.network.parameters(), _MAX_GRADIENT_NORM)
-    optimizer.step()
+    scaler.step(optimizer)
+    scaler.update()
     detached = {name: term.detach() for name, term in terms.items()}
     return {**detached, "learning_rate": rate, "gradient_norm": norm}
 
@@ -174,8 +194,10 @@ def _torch_seeded(seed: list[int], device: str) -> Iterator[None]:
     Dropout and sampling in a student do not accept a generator. Seeded per step, they draw the same
     numbers in a resumed training.
     """
-    devices = [] if device == "cpu" else range(torch.cuda.device_count())
-    with torch.random.fork_rng(devices=devices):
+    kind = torch.device(device).type
+    numbered = kind in {"cuda", "xpu"}  # the generators of other devices cannot be stored
+    devices = range(getattr(torch, kind).device_count()) if numbered else ()
+    with torch.random.fork_rng(devices, device_type=kind if numbered else "cuda"):
         torch.manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]))
         yield
 
@@ -186,7 +208,7 @@ def _first_student(
     categories: tuple[str, ...],
     start: Path | None,
 ) -> Student:
-    """Return the student before the first step, on the training device."""
+    """Return the student before the first step, on the CPU."""
     if start is None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -205,6 +227,4 @@ def _first_student(
             f"{start}: has preset {student.preset} and categories {', '.join(student.categories)}; "
             f"the training needs {settings.preset} and {', '.join(categories)}"
         )
-    check_device(settings.device)
-    student.network.to(settings.device)
     return student

@@ -11,6 +11,7 @@ from curate.category_names import renamed
 from curate.detections import Detections
 from curate.detectors.base import BatchDetector, Detector, NamesCategories
 from curate.detectors.devices import AUTO
+from curate.detectors.precision import FLOAT32
 from curate.errors import CurateError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
@@ -18,8 +19,10 @@ from curate.warnings_once import warn_once
 from db.models import BOX_COLUMNS
 from pipelines.assembly import batch_size, check_detector, open_detector
 from pipelines.category_names import check_detector_names
+from pipelines.devices import detector_place
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
+from pipelines.stages.reading import FrameReader
 from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
@@ -46,6 +49,7 @@ class Predict:
     def open(self) -> None:
         """Open the data set and load the detector."""
         self.dataset = open_dataset(self.config)
+        self.read = FrameReader(self._read)
         self.detector = open_detector(self.config, self.teacher, self.copies_of)
         check_detector_names(self.config, self.detector)
 
@@ -59,7 +63,17 @@ class Predict:
         found = self.detect([self.read(job.frame) for job in jobs])
         return for_each(self._rows, found)
 
-    def read(self, frame_id: str) -> Frame:
+    @property
+    def exclusive(self) -> bool:
+        """Whether the detector runs on a device that workers should not share."""
+        place = detector_place(self.config)
+        return place is not None and place.exclusive
+
+    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
+        """Begin to read the frames of the next call."""
+        self.read.announce(job.frame for job in jobs)
+
+    def _read(self, frame_id: str) -> Frame:
         """Return a frame as the detector sees it."""
         return visible(self.dataset.read(frame_id), self.config)
 
@@ -206,6 +220,8 @@ def settings_of_results(section: DetectorSection | SegmenterSection) -> Settings
     setting is left out while it is unset, so that results from before it stay valid.
     """
     unset = {name for name in ("rename", "provider_options") if not getattr(section, name)}
+    if getattr(section, "precision", None) == FLOAT32:
+        unset.add("precision")
     found = section.model_dump(mode="json", exclude={*_WITHOUT_EFFECT, *unset})
     return {**found, "device": AUTO} if "device" in found else found
 

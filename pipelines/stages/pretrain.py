@@ -19,12 +19,14 @@ from pipelines.stages.train_round import (
     store_statistics,
     train_with_progress,
     training_settings,
+    unset_precision,
 )
 from pipelines.workspace.workspace import Workspace
 
 _LATER_SETTINGS = {  # settings without effect on the first training
     "round_steps", "round_learning_rate", "unlabeled_batch_size", "threads", "start",
-    "zero_weight", "teacher", "ema_decay", "command", "labels_format", "statistics_steps",
+    "loaders", "zero_weight", "teacher", "ema_decay", "command", "labels_format",
+    "statistics_steps",
 }  # fmt: skip
 
 
@@ -43,7 +45,10 @@ def settings(workspace: Workspace) -> Any:
     renamed = [config.dataset.rename] if config.dataset.rename else []
     return [
         *renamed,
-        config.train.model_dump(mode="json", exclude=_LATER_SETTINGS) | {"preset": trained.preset},
+        config.train.model_dump(
+            mode="json", exclude=_LATER_SETTINGS.union(unset_precision(config.train))
+        )
+        | {"preset": trained.preset},
         sorted(labeled),
         config.run.seed,
         AUTO,  # the device: a teacher is kept, wherever it was trained

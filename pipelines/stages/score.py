@@ -15,6 +15,7 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.errors import WorkspaceError
+from curate.frames import Frame
 from curate.priors.base import Evidence, Measured, SequenceFrame, check_evidence
 from curate.priors.points import learn_thresholds
 from db import bulk
@@ -25,6 +26,7 @@ from pipelines.assembly import (
     point_settings,
     segmenter_path,
 )
+from pipelines.devices import segmenter_place
 from pipelines.engine.executors.base import FrameJob, FrameRows, SequenceJob
 from pipelines.engine.stage import (
     FramesStage,
@@ -37,6 +39,7 @@ from pipelines.engine.stage import (
 from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.stages.predict import settings_of_results
+from pipelines.stages.reading import FrameReader
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
@@ -59,15 +62,29 @@ class Score:
     def open(self) -> None:
         """Open the data set, the source and its models."""
         self.dataset = open_dataset(self.config)
+        self.read = FrameReader(self._read)
         self.prior = open_prior(self.config, self.source, self.thresholds)
+
+    @property
+    def exclusive(self) -> bool:
+        """Whether the segmenter runs on a device that workers should not share."""
+        place = segmenter_place(self.config) if PRIORS.takes(self.source, "segmenter") else None
+        return place is not None and place.exclusive
+
+    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
+        """Begin to read the frames of the next call."""
+        self.read.announce(job.frame for job in jobs)
+
+    def _read(self, frame_id: str) -> Frame:
+        """Return what the source needs of a frame."""
+        needs = self.prior
+        return self.dataset.read(frame_id, points=needs.needs_points, image=needs.needs_image)
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Return the rows of the source's table."""
         if job.predictions is None:
             raise WorkspaceError(f"frame {job.frame}: the job has no predictions")
-        frame = self.dataset.read(
-            job.frame, points=self.prior.needs_points, image=self.prior.needs_image
-        )
+        frame = self.read(job.frame)
         return self.rows(self.prior.score(frame, job.predictions), len(job.predictions))
 
     def rows(self, evidence: Evidence, count: int) -> FrameRows:
@@ -78,6 +95,8 @@ class Score:
 
 class Rescore(Score):
     """Scores the labels of a frame from stored measurements."""
+
+    exclusive = False
 
     def open(self) -> None:
         """Open the source alone, without data set and segmenter."""

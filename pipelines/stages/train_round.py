@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 from sqlalchemy import Connection
 
 from curate.detectors.devices import AUTO, choose_device
+from curate.detectors.precision import FLOAT32
 from curate.errors import ConfigError, one_line
+from curate.files.onnx_providers import CPU
 from curate.frames import Frame
 from curate.spelling import did_you_mean
 from db import bulk
@@ -19,6 +21,7 @@ from pipelines.assembly import (
     trainable_detector,
     trained_detector,
 )
+from pipelines.engine.executors.machine import affordable_workers, usable_cores
 from pipelines.engine.progress import Progress, as_total
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
@@ -26,11 +29,14 @@ from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally
 from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.stages.vanished import check_labels
+from pipelines.workspace.config import TrainSection
 from pipelines.workspace.workspace import Workspace
 
 if TYPE_CHECKING:
     from curate.detectors.base import TrainableDetector
     from curate.training.settings import Statistic, TrainingReport, TrainingSettings
+
+MOST_LOADERS = 8
 
 
 def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settings:
@@ -46,10 +52,12 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
                 "pretrain_steps",
                 "learning_rate",
                 "threads",
+                "loaders",
                 "ema_decay",
                 "command",
                 "labels_format",
                 "statistics_steps",
+                *unset_precision(section),
             },
         ),
         "preset": trainable and trainable.preset,
@@ -61,6 +69,19 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
         "detector": workspace.config.detector.name,
         "checkpoint": trainable and trainable.detector.checkpoint_version,
     }
+
+
+def unset_precision(section: TrainSection) -> tuple[str, ...]:
+    """Return the key of `precision` if it is the default: results from before it stay valid."""
+    return ("precision",) if section.precision == FLOAT32 else ()
+
+
+def loaders(section: TrainSection, device: str) -> int:
+    """Return how many processes prepare the batches of a training on a device."""
+    if section.loaders != "auto":
+        return section.loaders
+    spare = min(MOST_LOADERS, usable_cores() - 1)
+    return affordable_workers(spare) if device != CPU.name and spare else 0
 
 
 def file(workspace: Workspace, context: RoundContext, policy: str) -> Path:
@@ -182,6 +203,7 @@ def training_settings(
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
+    device = choose_device(workspace.config.detector.device)
     values = {
         "preset": trained_detector(workspace.config).preset,
         "steps": steps,
@@ -194,7 +216,9 @@ def training_settings(
         "ema_decay": section.ema_decay,
         "statistics_steps": section.statistics_steps,
         "seed": workspace.config.run.seed + round_number,
-        "device": choose_device(workspace.config.detector.device),
+        "device": device,
+        "loaders": loaders(section, device),
+        "precision": section.precision,
     }
     try:
         return TrainingSettings(**{**values, **section.options})

@@ -23,6 +23,7 @@ from pydantic import (
 
 from curate.category_names import check_rename
 from curate.detections import CATEGORIES
+from curate.detectors.precision import Precision
 from curate.errors import ConfigError, one_line
 from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
@@ -219,6 +220,11 @@ class DetectorSection(Section):
     provider_options: dict[ProviderName, Options] = Field(
         default={},
         description="Options of the providers by their names, such as {cuda = {device_id = 1}}.",
+    )
+    precision: Precision = Field(
+        default="float32",
+        description="Type of numbers in which a detector in torch predicts. The shorter ones save "
+        "time on a GPU and change scores in about the third digit.",
     )
     minimum_score: Share = Field(
         default=0.1,
@@ -448,6 +454,18 @@ class TrainSection(Section):
     )
     threads: AtLeastOne = Field(
         default=1, description="CPU threads of a training.", json_schema_extra=_unit("threads")
+    )
+    loaders: Count | Literal["auto"] = Field(
+        default="auto",
+        description="Processes that prepare the batches of a training ahead. 'auto': none on the "
+        "CPU, else one per core but one, at most 8, or fewer if the memory is too small. They "
+        "change no result.",
+        json_schema_extra=_unit("processes"),
+    )
+    precision: Precision = Field(
+        default="float32",
+        description="Type of numbers in which the network computes in a training. The shorter ones "
+        "save time and memory on a GPU; weights and loss stay float32.",
     )
     zero_weight: Literal["method", "ignore", "background"] = Field(
         default="method",

@@ -1,5 +1,7 @@
 """Where models run: device and providers of the configuration, on machines that are not here."""
 
+import threading
+
 import pytest
 import torch
 from support.fake_providers import FakeRuntime, fake_providers
@@ -7,10 +9,12 @@ from support.pipelines_cli import Curate
 from support.tiny_onnx import tiny_detector
 
 from curate.detectors.devices import check_device_name, choose_device
-from curate.errors import ConfigError
+from curate.errors import ConfigError, DataError
 from pipelines.assembly import check_detector, check_segmenter, open_detector
 from pipelines.devices import Place, detector_place, idle_gpu, segmenter_place
 from pipelines.stages.predict import settings_of_results
+from pipelines.stages.reading import FrameReader
+from pipelines.stages.train_round import loaders
 from pipelines.workspace.config import make_config
 
 
@@ -160,3 +164,55 @@ def test_doctor_says_where_models_run(curate: Curate, tmp_path, toy_kitti, monke
     assert code == 0, err
     _, out, _ = curate("doctor", "-w", tmp_path / "w")
     assert "ok       devices      detector in ONNX Runtime on cuda, or cpu" in out
+
+
+@pytest.mark.parametrize(
+    ("cores", "device", "section", "expected"),
+    [(16, "cpu", {}, 0), (16, "cuda", {}, 8), (4, "mps", {}, 3), (1, "cuda", {}, 0),
+     (16, "cpu", {"loaders": 2}, 2), (16, "cuda", {"loaders": 0}, 0)],
+)  # fmt: skip
+def test_batches_are_prepared_by_other_processes_where_there_is_a_gpu(
+    monkeypatch, cores, device, section, expected
+):
+    monkeypatch.setattr("pipelines.stages.train_round.usable_cores", lambda: cores)
+    monkeypatch.setattr("pipelines.stages.train_round.affordable_workers", lambda number: number)
+    assert loaders(config(train=section).train, device) == expected
+
+
+def test_a_mixed_precision_needs_a_detector_in_torch(gpu, tmp_path):
+    """Pillars on the CPU then runs in torch, too; a model in ONNX has the precision of its file."""
+    assert detector_place(config(detector={"device": "cpu", "precision": "bfloat16"})) == (
+        Place("cpu")
+    )
+    check_detector(config(detector={"device": "cpu", "precision": "bfloat16"}))
+    for other in ({"name": "onnx"}, {"name": "recorded"}, {"providers": ["cpu"]}):
+        section = {"path": str(tmp_path), "precision": "bfloat16", **other}
+        with pytest.raises(ConfigError, match=r"detector\.precision: .*remove the setting"):
+            check_detector(config(detector=section))
+
+
+def test_a_precision_is_part_of_what_results_depend_on():
+    """Unless it is the default: results from before the setting stay valid."""
+    first = settings_of_results(config().detector)
+    assert "precision" not in first
+    other = config(detector={"precision": "bfloat16"}).detector
+    assert settings_of_results(other)["precision"] == "bfloat16"
+
+
+def test_frames_are_read_in_threads_once_announced():
+    """Each once; an error appears where the frame is needed."""
+    threads = []
+
+    def read(name):
+        threads.append((name, threading.current_thread() is threading.main_thread()))
+        if name == "b":
+            raise DataError("frame b is damaged")
+        return name
+
+    reader = FrameReader(read)
+    reader.announce("ab")
+    assert reader("a") == "a"
+    with pytest.raises(DataError, match="frame b is damaged"):
+        reader("b")
+    assert reader("c") == "c"
+    assert sorted(threads) == [("a", False), ("b", False), ("c", True)]

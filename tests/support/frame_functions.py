@@ -151,3 +151,26 @@ class Napping:
         """Return the process as a row."""
         time.sleep(self.seconds)
         return {"processes": {"pid": [os.getpid()]}}
+
+
+@dataclass
+class OnDevice:
+    """A model on a GPU: returns the process that computed a frame, and what it was told before.
+
+    Attributes:
+        exclusive: whether workers should not share the device.
+    """
+
+    exclusive: bool = True
+
+    def open(self) -> None:
+        """Begin to record."""
+        self.announced: list[int] = []
+
+    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
+        """Record the frames that will be needed next."""
+        self.announced += [job.frame_id for job in jobs]
+
+    def __call__(self, job: FrameJob) -> FrameRows:
+        """Return the process, and the frames that were announced so far."""
+        return {"done": {"process": [os.getpid()], "announced": [list(self.announced)]}}

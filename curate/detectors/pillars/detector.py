@@ -1,6 +1,6 @@
 """The trained pillar detector: runs in ONNX Runtime on the CPU and in torch on a GPU."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -18,8 +18,9 @@ from curate.detectors.pillars.checkpoint import (
     load_checkpoint,
     write_graph,
 )
-from curate.detectors.pillars.encoding import Pillars, decode, encode_points
+from curate.detectors.pillars.encoding import Pillars, decode, encode_points, joined
 from curate.detectors.pillars.presets import PRESETS
+from curate.detectors.precision import FLOAT32, Precision, mixed_precision
 from curate.errors import ModelError
 from curate.files.onnx_providers import (
     AUTO,
@@ -40,6 +41,11 @@ if TYPE_CHECKING:
 
 FrameOutput = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Scores, box codes and estimated IoU of one frame."""
+Forward = Callable[[Sequence[Pillars]], list[FrameOutput]]
+"""Runs the network on several frames."""
+
+# Frames that a GPU gets at a time.
+_GPU_BATCH = 8
 
 
 class PillarDetector:
@@ -51,6 +57,7 @@ class PillarDetector:
         minimum_score: boxes with a lower score are left out.
         nms_iou: BEV IoU above which the higher-scored box of a category suppresses the other.
         threads: number of threads of the network, on the CPU.
+        precision: "float32", or in torch "bfloat16" or "float16" (mixed precision).
         providers: providers of ONNX Runtime to use in place of the device; "auto" for none.
         provider_options: options of the providers by their names.
 
@@ -71,6 +78,7 @@ class PillarDetector:
         minimum_score: float = 0.1,
         nms_iou: float = 0.1,
         threads: int = 1,
+        precision: Precision = FLOAT32,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
     ) -> None:
@@ -80,8 +88,8 @@ class PillarDetector:
         self._nms_iou = nms_iou
         self._forward = (
             onnx_forward(checkpoint, self._checkpoint, threads, providers, provider_options)
-            if device == "cpu" or listed_providers(providers)
-            else torch_forward(checkpoint, self._checkpoint, device)
+            if listed_providers(providers) or (device == CPU.name and precision == FLOAT32)
+            else torch_forward(checkpoint, self._checkpoint, device, precision)
         )
 
     @classmethod
@@ -112,14 +120,31 @@ class PillarDetector:
         """See `curate.detectors.base.NamesCategories`."""
         return self.categories
 
+    @classmethod
+    def batch_size(cls, device: str) -> int:
+        """See `curate.detectors.base.BatchDetector`."""
+        return 1 if device == CPU.name else _GPU_BATCH
+
     def predict(self, frame: Frame) -> Detections:
         """See `curate.detectors.base.Detector`."""
-        preset = self._checkpoint.preset
-        ground = GroundMap.of(frame.points)
-        pillars = encode_points(ground.lowered(frame.points), preset)
-        if len(pillars.slots) == 0:
-            return Detections.empty()
-        found = decode(*self._forward(pillars), self.categories, preset, self._minimum_score)
+        return self.predict_batch([frame])[0]
+
+    def predict_batch(self, frames: Sequence[Frame]) -> list[Detections]:
+        """See `curate.detectors.base.BatchDetector`."""
+        grounds = [GroundMap.of(frame.points) for frame in frames]
+        pillars = [
+            encode_points(ground.lowered(frame.points), self._checkpoint.preset)
+            for ground, frame in zip(grounds, frames, strict=True)
+        ]
+        outputs = iter(self._forward([each for each in pillars if len(each.slots)]))
+        return [
+            self._detections(next(outputs), ground) if len(each.slots) else Detections.empty()
+            for each, ground in zip(pillars, grounds, strict=True)
+        ]
+
+    def _detections(self, output: FrameOutput, ground: GroundMap) -> Detections:
+        """Return the boxes of one frame after non-maximum suppression, by descending score."""
+        found = decode(*output, self.categories, self._checkpoint.preset, self._minimum_score)
         kept = [np.zeros(0, dtype=np.int64)]
         for category in self.categories:
             of_category = np.flatnonzero(found.categories == category)
@@ -136,8 +161,8 @@ def onnx_forward(
     threads: int,
     providers: Providers = AUTO,
     options: ProviderOptions | None = None,
-) -> Callable[[Pillars], FrameOutput]:
-    """Return a function that runs the checkpoint's ONNX graph in ONNX Runtime.
+) -> Forward:
+    """Return a function that runs the checkpoint's ONNX graph in ONNX Runtime, frame by frame.
 
     Builds the graph first if it is missing or belongs to another checkpoint. Without a list of
     providers it runs on the CPU.
@@ -157,34 +182,49 @@ def onnx_forward(
         write_graph(path, checkpoint, digest)
         session = open_graph()
 
-    def forward(pillars: Pillars) -> FrameOutput:
+    def forward_one(pillars: Pillars) -> FrameOutput:
         inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
         scores, codes, ious = session.run(["scores", "codes", "ious"], inputs)
         return scores, codes, ious[..., 0]
 
-    return forward
+    return lambda frames: [forward_one(pillars) for pillars in frames]
 
 
 def torch_forward(
-    path: Path, checkpoint: Checkpoint, device: str
-) -> Callable[[Pillars], FrameOutput]:
-    """Return a function that runs the network in torch on a device, such as a GPU."""
+    path: Path, checkpoint: Checkpoint, device: str, precision: Precision = FLOAT32
+) -> Forward:
+    """Return a function that runs the network in torch on a device, all frames in one pass.
+
+    Raises:
+        ConfigError: if the device or the precision cannot be used.
+        ModelError: if the checkpoint does not fit its preset.
+    """
     import torch
 
-    from curate.detectors.pillars.network import SingleFrame, network_of
+    from curate.detectors.pillars.network import network_of
 
     check_device(device)
-    torch_device = torch.device(device)
+    mixed = mixed_precision(precision, device)
     try:
-        network = SingleFrame(network_of(checkpoint)).eval().to(torch_device)
+        network = network_of(checkpoint).eval().to(device)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
 
-    def forward(pillars: Pillars) -> FrameOutput:
-        with torch.inference_mode():
-            features = torch.from_numpy(pillars.features).to(torch_device)
-            slots = torch.from_numpy(pillars.slots).to(torch_device)
-            scores, codes, ious = network(features, slots)
-        return scores.cpu().numpy(), codes.cpu().numpy(), ious.cpu().numpy()
+    def forward(frames: Sequence[Pillars]) -> list[FrameOutput]:
+        if not frames:
+            return []
+        features, slots = joined(frames, checkpoint.preset)
+        # NVIDIA's TensorFloat-32 would change the third digit of a score.
+        exact = torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
+        with torch.inference_mode(), mixed, exact:
+            output = network(
+                torch.from_numpy(features).to(device, non_blocking=True),
+                torch.from_numpy(slots).to(device, non_blocking=True),
+                len(frames),
+            )
+            scores = torch.sigmoid(output.logits.float()).cpu().numpy()
+            codes = output.codes.float().cpu().numpy()
+            ious = torch.sigmoid(output.iou_logits.float()).cpu().numpy()
+        return list(zip(scores, codes, ious, strict=True))
 
     return forward

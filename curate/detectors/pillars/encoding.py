@@ -30,6 +30,7 @@ code 0 = -1.25. The weight v of the car is shared: 57 % for the centre cell, 17 
 neighbour (30, 45), less for the others.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +68,13 @@ class Pillars:
 
     features: np.ndarray
     slots: np.ndarray
+
+
+def joined(frames: Sequence[Pillars], preset: Preset) -> tuple[np.ndarray, np.ndarray]:
+    """Return features and slots of several frames as one input of the network."""
+    slots_per_frame = 4 * preset.cells[0] * preset.cells[1]
+    slots = [frame.slots + i * slots_per_frame for i, frame in enumerate(frames)]
+    return np.concatenate([frame.features for frame in frames]), np.concatenate(slots)
 
 
 @dataclass(frozen=True)

@@ -92,23 +92,6 @@ class PillarNetwork(nn.Module):
         )
 
 
-class SingleFrame(nn.Module):
-    """The network for inference: one frame in, scores, box codes and IoU estimates out."""
-
-    def __init__(self, network: PillarNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, features: Tensor, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the scores, box codes and IoU estimates of the frame's cells.
-
-        Returns:
-            (x cells, y cells, categories), (x cells, y cells, BOX_CODE) and (x cells, y cells).
-        """
-        logits, codes, iou_logits = self.network(features, slots, 1)
-        return torch.sigmoid(logits[0]), codes[0], torch.sigmoid(iou_logits[0])
-
-
 class SlotMaximum(torch.autograd.Function):
     """Maximum over the points of each slot, 0 in empty slots; inputs must not be negative.
 

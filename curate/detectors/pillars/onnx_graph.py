@@ -15,7 +15,7 @@ from curate.files.onnx_graph import EPSILON, GraphBuilder
 
 
 def build_graph(weights: Mapping[str, np.ndarray], preset: Preset, categories: int) -> ModelProto:
-    """Return the graph of `network.SingleFrame`.
+    """Return the graph of `network.PillarNetwork` for one frame, with probabilities as scores.
 
     The inputs of the graph are `features` (n, POINT_FEATURES) float32 and `slots` (n, 1) int64,
     n > 0. The outputs are `scores` (x cells, y cells, categories), `codes` (x cells, y cells,

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from curate.detectors.base import Sample
 from curate.detectors.pillars.checkpoint import load_checkpoint, save_checkpoint
-from curate.detectors.pillars.encoding import encode_boxes, encode_points
+from curate.detectors.pillars.encoding import encode_boxes, encode_points, joined
 from curate.detectors.pillars.loss import BatchTargets, weighted_loss
-from curate.detectors.pillars.network import PillarNetwork, checkpoint_of, network_of
+from curate.detectors.pillars.network import NetworkOutput, PillarNetwork, checkpoint_of, network_of
 from curate.detectors.pillars.presets import preset_named
 from curate.errors import ModelError
 
@@ -75,11 +75,10 @@ class PillarStudent:
             ids = np.array([names.index(name) for name in sample.categories], dtype=np.int64)
             boxes = ground.lowered(sample.boxes)
             targets.append(encode_boxes(boxes, ids, sample.weights, len(names), preset))
-        slots_per_frame = 4 * preset.cells[0] * preset.cells[1]
-        slots = [frame.slots + i * slots_per_frame for i, frame in enumerate(pillars)]
+        features, slots = joined(pillars, preset)
         return Batch(
-            torch.from_numpy(np.concatenate([frame.features for frame in pillars])).to(device),
-            torch.from_numpy(np.concatenate(slots)).to(device),
+            torch.from_numpy(features).to(device),
+            torch.from_numpy(slots).to(device),
             len(pillars),
             BatchTargets.stack(targets, device),
         )
@@ -87,6 +86,7 @@ class PillarStudent:
     def loss(self, batch: Batch, expected_objects: float) -> Mapping[str, Tensor]:
         """Return the weighted loss and its heatmap, box and IoU terms."""
         output = self.network(batch.features, batch.slots, batch.frames)
+        output = NetworkOutput(*(each.float() for each in output))  # of mixed precision
         return weighted_loss(output, batch.targets, self.network.preset, expected_objects)
 
     def save(self, path: Path, weights: Mapping[str, Tensor]) -> None:

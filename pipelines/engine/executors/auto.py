@@ -20,6 +20,7 @@ from pipelines.engine.executors.base import (
     Job,
     JobFunction,
     Outcome,
+    is_exclusive,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
@@ -37,11 +38,13 @@ class AutoExecutor:
     """Processes frames in this process, or in worker processes when that saves time.
 
     Args:
-        workers: the most worker processes; None for one per usable core. The free memory may
+        workers: the most worker processes; None for one per usable core, and none for a model on
+            a GPU. The free memory may
             allow fewer: each worker needs about as much as this process with the model loaded.
     """
 
     def __init__(self, workers: int | None = None) -> None:
+        self._automatic = workers is None
         self._limit = usable_cores() if workers is None else workers
         self._pool: ProcessExecutor | None = None
 
@@ -56,7 +59,7 @@ class AutoExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        if self._limit == 1:
+        if self._limit == 1 or (self._automatic and is_exclusive(function)):
             yield from SerialExecutor().map(function, jobs)
             return
         packed = pickle.dumps(function)  # before the models are loaded into it

@@ -173,6 +173,40 @@ class SequenceFunction(Protocol):
 JobFunction = FrameFunction | BatchFunction | SequenceFunction
 
 
+@runtime_checkable
+class DeviceFunction(Protocol):
+    """A function with a model that may run on a device which workers should not share: a GPU."""
+
+    @property
+    def exclusive(self) -> bool:
+        """Whether it does. Then one worker is started unless the user asks for more."""
+        ...
+
+    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
+        """Begin to read the frames of the next call in threads, while the device computes."""
+        ...
+
+
+def is_exclusive(function: JobFunction) -> bool:
+    """Return whether workers should not share the device of a function's model."""
+    return isinstance(function, DeviceFunction) and function.exclusive
+
+
+def reading_ahead(function: JobFunction, jobs: Iterable[Job]) -> Iterator[Job]:
+    """Yield the jobs; the frames of the next one are read in the meantime, see `DeviceFunction`."""
+    if not (isinstance(function, DeviceFunction) and function.exclusive):
+        yield from jobs
+        return
+    waiting: Job | None = None
+    for job in jobs:
+        if waiting is not None:
+            function.prefetch(job.frames)
+            yield waiting
+        waiting = job
+    if waiting is not None:
+        yield waiting
+
+
 def batches_for(function: JobFunction, jobs: Iterable[Part]) -> Iterator[Job]:
     """Return the jobs, in batches if the function processes several frames in one call."""
     if not isinstance(function, BatchFunction):

@@ -24,6 +24,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
+    is_exclusive,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
@@ -37,11 +38,13 @@ class ProcessExecutor:
     """Processes frames in spawned processes, which live until `close`.
 
     Args:
-        workers: number of processes; None for one per usable core.
+        workers: number of processes; None for one per usable core, and one for a model on a GPU.
     """
 
     def __init__(self, workers: int | None = None) -> None:
+        self._automatic = workers is None
         self.workers = usable_cores() if workers is None else workers
+        self._limit = self.workers
         self._workers: list[_Worker] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
@@ -50,7 +53,8 @@ class ProcessExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        queue = JobQueue(jobs, self.workers)
+        self._limit = 1 if self._automatic and is_exclusive(function) else self.workers
+        queue = JobQueue(jobs, self._limit)
         packed = pickle.dumps(function)
         try:
             while True:
@@ -76,8 +80,9 @@ class ProcessExecutor:
 
     def _dispatch(self, packed: bytes, queue: JobQueue) -> None:
         while (job := queue.take()) is not None:
-            idle = min(self._workers, key=lambda worker: len(worker.in_flight), default=None)
-            if len(self._workers) < self.workers and (idle is None or idle.in_flight):
+            used = self._workers[: self._limit]
+            idle = min(used, key=lambda worker: len(worker.in_flight), default=None)
+            if len(used) < self._limit and (idle is None or idle.in_flight):
                 self._workers.append(idle := _Worker())
             if idle is None or len(idle.in_flight) == JOBS_PER_WORKER:
                 queue.return_jobs([job])

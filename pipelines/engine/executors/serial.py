@@ -9,6 +9,7 @@ from pipelines.engine.executors.base import (
     attempt,
     open_function,
     outcomes_of,
+    reading_ahead,
 )
 
 
@@ -22,7 +23,7 @@ class SerialExecutor:
             CurateError: if the models cannot be loaded.
         """
         open_function(function)
-        for job in jobs:
+        for job in reading_ahead(function, jobs):
             yield from outcomes_of(job, attempt(function, job))
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from curate.detectors.pillars import PillarDetector
-from curate.detectors.pillars.checkpoint import graph_path, save_checkpoint
+from curate.detectors.pillars.checkpoint import graph_path, load_checkpoint, save_checkpoint
 from curate.detectors.pillars.detector import onnx_forward, torch_forward
 from curate.detectors.pillars.encoding import encode_points
 from curate.detectors.pillars.network import PillarNetwork, SlotMaximum, checkpoint_of
@@ -63,13 +63,56 @@ def test_onnx_runtime_and_torch_agree(tmp_path, preset, count):
     path, checkpoint = tmp_path / "net.safetensors", lively(preset)
     save_checkpoint(path, checkpoint)
     pillars = encode_points(cloud(count), PRESETS[preset])
-    by_onnx = onnx_forward(path, checkpoint, 1)(pillars)
-    by_torch = torch_forward(path, checkpoint, "cpu")(pillars)
+    (by_onnx,) = onnx_forward(path, checkpoint, 1)([pillars])
+    (by_torch,) = torch_forward(path, checkpoint, "cpu")([pillars])
     assert by_onnx[0].shape == (*PRESETS[preset].cells, 3)
     assert by_onnx[2].shape == PRESETS[preset].cells
     assert np.ptp(by_torch[1]) > 0.1
     for ours, theirs in zip(by_onnx, by_torch, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_a_batch_finds_the_boxes_of_each_frame(small):
+    """To the last bit in ONNX Runtime; a frame may be empty."""
+    empty = np.zeros((0, 4), dtype=np.float32)
+    frames = [frame_of(each) for each in (cloud(900), empty, cloud(700, 1))]
+    detector = PillarDetector(small, minimum_score=0.001)
+    expected = [detector.predict(frame) for frame in frames]
+    assert [len(each) > 0 for each in expected] == [True, False, True]
+    for found, alone in zip(detector.predict_batch(frames), expected, strict=True):
+        np.testing.assert_array_equal(found.boxes, alone.boxes)
+    assert detector.predict_batch([]) == []
+
+
+def test_frames_of_a_batch_do_not_change_each_other_in_torch(small):
+    """As on a GPU: one pass for all of them, equal up to rounding."""
+    frames = [encode_points(cloud(count, count), PRESETS["small"]) for count in (900, 1, 300)]
+    forward = torch_forward(small, load_checkpoint(small), "cpu")
+    for together, pillars in zip(forward(frames), frames, strict=True):
+        for found, alone in zip(together, forward([pillars])[0], strict=True):
+            np.testing.assert_allclose(found, alone, rtol=1e-4, atol=1e-5)
+    assert forward([]) == []
+
+
+@pytest.mark.parametrize(("precision", "digits"), [("bfloat16", 0.05), ("float16", 0.01)])
+def test_mixed_precision_finds_about_the_same(small, precision, digits):
+    """In torch, also on the CPU."""
+    pillars = [encode_points(cloud(900), PRESETS["small"])]
+    exact, rough = (
+        torch_forward(small, load_checkpoint(small), "cpu", each)(pillars)[0][0]
+        for each in ("float32", precision)
+    )
+    assert rough.dtype == np.float32
+    assert 0 < np.abs(rough - exact).max() < digits
+    detector = PillarDetector(small, minimum_score=0.001, precision=precision)
+    assert len(detector.predict(frame_of(cloud(900)))) > 0
+    with pytest.raises(ConfigError, match="unknown precision 'half'"):
+        PillarDetector(small, precision="half")
+
+
+def test_a_gpu_gets_batches_and_the_cpu_single_frames():
+    assert PillarDetector.batch_size("cpu") == 1
+    assert PillarDetector.batch_size("cuda") == PillarDetector.batch_size("mps") == 8
 
 
 def test_an_empty_frame_has_no_detections(small):
