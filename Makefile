@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 # "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
 SIMULATION ?= yes
 
-.PHONY: venv demo test shapes prove prove-bare fuzz fuzz-all bench lint docs site wheel clean
+.PHONY: venv demo test shapes prove prove-gpu prove-bare fuzz fuzz-all bench lint docs site wheel clean
 
 venv: $(READY)
 
@@ -23,6 +23,10 @@ shapes: $(READY)
 
 prove: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Checks on a GPU, with frames per second; without one it says that they were not run.
+prove-gpu: $(READY)
+	$(BIN)/python .ci/prove_gpu.py
 
 # Installation, demo and a part of the tests in minimal systems that debootstrap makes; as root.
 SUITES ?= bookworm trixie
