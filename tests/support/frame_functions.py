@@ -70,11 +70,14 @@ class SquareBatches:
     Attributes:
         folder: where it records the batches: the first key, and the number of frames.
         deadly: frames that kill the worker.
+        batch_size: the most frames of a batch.
+        workers: the most workers that run it at the same time.
     """
 
     folder: Path
     deadly: tuple[int, ...] = ()
     batch_size: int = 8
+    workers: int | None = None
 
     def open(self) -> None:
         """Do nothing."""

@@ -20,6 +20,7 @@ from pipelines.engine.executors.base import (
     Job,
     JobFunction,
     Outcome,
+    allowed_workers,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
@@ -56,7 +57,8 @@ class AutoExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        if self._limit == 1:
+        limit = allowed_workers(function, self._limit)
+        if limit == 1:
             yield from SerialExecutor().map(function, jobs)
             return
         packed = pickle.dumps(function)  # before the models are loaded into it
@@ -73,7 +75,7 @@ class AutoExecutor:
                 seconds.append(sum(result.seconds for result in results))
                 yield from outcomes_of(job, results)
             left = operator.length_hint(jobs, -1)
-            if self._saves_time(left, median(seconds[1:] or seconds), opening_s):
+            if self._saves_time(left, median(seconds[1:] or seconds), opening_s, limit):
                 workers = min(affordable_workers(self._limit), max(left, 0) or self._limit)
                 if workers > 1:
                     del here  # frees the memory of its models
@@ -85,12 +87,12 @@ class AutoExecutor:
         if self._pool:
             self._pool.close()
 
-    def _saves_time(self, left: int, job_s: float, opening_s: float) -> bool:
+    def _saves_time(self, left: int, job_s: float, opening_s: float, workers: int) -> bool:
         """Return whether the remaining jobs would end earlier with workers."""
         if left < 0:
             return True
         start_s = opening_s + (0.0 if self._pool else START_S)
-        return left * job_s > start_s + left * job_s / self._limit
+        return left * job_s > start_s + left * job_s / workers
 
     def _workers(self, workers: int) -> ProcessExecutor:
         """Return the pool; it lives until `close`, so that later stages find its workers."""

@@ -24,6 +24,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
+    allowed_workers,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
@@ -50,11 +51,12 @@ class ProcessExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        queue = JobQueue(jobs, self.workers)
+        workers = allowed_workers(function, self.workers)
+        queue = JobQueue(jobs, workers)
         packed = pickle.dumps(function)
         try:
             while True:
-                self._dispatch(packed, queue)
+                self._dispatch(packed, queue, workers)
                 busy = {worker.connection: worker for worker in self._workers if worker.in_flight}
                 if not busy:
                     return
@@ -74,10 +76,11 @@ class ProcessExecutor:
             worker.process.join(POLL_S)
             self._dismiss(worker)
 
-    def _dispatch(self, packed: bytes, queue: JobQueue) -> None:
+    def _dispatch(self, packed: bytes, queue: JobQueue, workers: int) -> None:
         while (job := queue.take()) is not None:
-            idle = min(self._workers, key=lambda worker: len(worker.in_flight), default=None)
-            if len(self._workers) < self.workers and (idle is None or idle.in_flight):
+            crew = self._workers[:workers]
+            idle = min(crew, key=lambda worker: len(worker.in_flight), default=None)
+            if len(crew) < workers and (idle is None or idle.in_flight):
                 self._workers.append(idle := _Worker())
             if idle is None or len(idle.in_flight) == JOBS_PER_WORKER:
                 queue.return_jobs([job])
