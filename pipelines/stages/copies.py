@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from curate.datasets.copies import copy_kind
-from curate.datasets.manifest import NAME, Manifest, identity_of, view_folder
+from curate.datasets.manifest import NAME, Manifest, sample_hashes, view_folder
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError, DataError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
-    describe_few_matches,
-    examine_copied_headings,
-    examine_copies,
+    examine_view,
 )
 from curate.frames import RotationY
 from curate.geometry.augmented_views import AugmentedViews
@@ -59,7 +57,7 @@ def manifest_of(
         drawn,
         camera_view,
         config.dataset.kind,
-        identity_of(dataset, frames),
+        sample_hashes(dataset, frames),
         copy_kind(dataset),
         declared or rotation_y_of_tools(dataset.read(frames[0], points=False).calibration),
         {name: drawn.draw(name) for name in frames},
@@ -116,7 +114,7 @@ def _problem(
     """Return in which way the results of a view do not belong to its copies; "" if they do."""
     chosen = frames[:: max(1, len(frames) // _COMPARED)]
 
-    def read(meaning: RotationY | None = None) -> list[CopiedFrame]:
+    def read(meaning: RotationY | None) -> list[CopiedFrame]:
         found = []
         for name in chosen:
             try:
@@ -127,7 +125,7 @@ def _problem(
             found.append(CopiedFrame(plain, copy, manifest.frames[name]))
         return found
 
-    compared = read()
-    if few := describe_few_matches(view, compared):
-        _log.warning("%s: %s", detector.views_of_copies[view].path, few)
-    return examine_copies(view, compared) or examine_copied_headings(view, compared, read)
+    problem, remark = examine_view(view, read)
+    if remark and not problem:
+        _log.warning("%s: %s", detector.views_of_copies[view].path, remark)
+    return problem

@@ -12,13 +12,13 @@ from curate.detectors.base import CopiesDetector, RecordedViews
 from curate.errors import CurateError, ModelError, WorkspaceError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
-    examine_copied_headings,
-    examine_copies,
+    examine_view,
 )
 from curate.frames import RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotations_y_of_yaws, yaws_of_rotations_y
 from curate.geometry.similarity import Similarity
+from curate.warnings_once import warn_once
 from pipelines.assembly import Place, consistency_settings, copies_folder, runs_elsewhere
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
@@ -108,7 +108,7 @@ class Repredict(Predict):
             ModelError: if they do not, or their headings have another meaning.
         """
 
-        def read(meaning: RotationY | None = None) -> list[CopiedFrame]:
+        def read(meaning: RotationY | None) -> list[CopiedFrame]:
             frames = []
             for job, found in zip(jobs, views, strict=True):
                 similarity, copy = found[view]
@@ -120,9 +120,13 @@ class Repredict(Predict):
                 frames.append(CopiedFrame(job.predictions, copy, [a for a, _ in found]))
             return frames
 
-        found = read()
-        if problem := examine_copies(view, found) or examine_copied_headings(view, found, read):
+        problem, remark = examine_view(view, read)
+        if problem:
+            setting = "detector.options.rotation_y"
+            problem = problem.replace(setting, "detector.options.results.rotation_y")
             raise ModelError(f"detector.options.command, view {view + 1}: {problem}")
+        if remark:
+            warn_once(f"detector.options.command, view {view + 1}: {remark}")
 
     def _read_as(
         self,
