@@ -74,7 +74,7 @@ class CommandDetector:
         path: StrPath | None,
         minimum_score: float = 0.0,
         *,
-        command: str,
+        command: str = "",
         results: Mapping[str, Any] | None = None,
         files: Sequence[str] = (),
         camera_view: bool = False,

@@ -240,6 +240,7 @@ def test_results_are_found_by_a_pattern(
         ("sh infer.sh {cloud} {results}", {}, "unknown placeholder {cloud}; did you mean 'clouds'"),
         ("sh infer.sh {data} {results} {teacher}", {}, "but detector.path, the checkpoint of the"),
         ("sh 'infer.sh", {}, "No closing quotation"),
+        ("", {}, "detector.options.command: is empty; write a program and its arguments"),
         ("sh", {"results": {"kinds": "csv"}}, "has no 'kinds'; did you mean 'kind'?"),
         ("sh", {"results": {"rename": {}}}, "has no 'rename'; set detector.rename"),
         ("sh", {"results": {"kind": "cvs"}}, "detector.options.kind 'cvs': use one of"),
