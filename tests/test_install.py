@@ -96,7 +96,7 @@ progress.show()
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.split("\n")  # text mode reads a carriage return as a new line
 
-    assert re.match(r"  fetching torch, 0 of about 100 MB, \d s, about \d s left", shown[1])
+    assert re.match(r"  fetching torch, 0 of about 100 MB, \d+ s, about \d+ s left", shown[1])
     assert shown[2].startswith("  fetching scipy, ")
     assert shown[3].startswith("  installing 3 packages, ")
     assert {len(line) for line in shown[1:]} == {79}
