@@ -110,6 +110,7 @@ class FolderDataset:
     """
 
     name = "folder"
+    copied_as = "folder"
 
     def __init__(
         self,
@@ -130,7 +131,7 @@ class FolderDataset:
                 f"{self._path}: no such description file{layout_hint(self.root, self.name)}"
             )
         self._description = _read_description(self._path)
-        self._layout = _merged(_described_layout(self._path, self._description), layout, self._path)
+        self.layout = _merged(_described_layout(self._path, self._description), layout, self._path)
         self._cameras = _cameras(self._path, self._description)
         paths = [self._description[key] for key in _FOLDERS if key in self._description]
         paths += [camera.images.folder for camera in self._cameras if camera.images]
@@ -215,7 +216,7 @@ class FolderDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_cloud(files.points, self._layout)
+            sweep = read_cloud(files.points, self.layout)
         found = Frame(frame_id, sweep, self._label_calibration(frame_id), None)
         if not self._cameras:
             return found

@@ -58,6 +58,11 @@ class Similarity:
             float(generator.uniform(*scale_range)),
         )
 
+    @property
+    def inverse_rotation(self) -> Float[np.ndarray, "3 3"]:
+        """The (3, 3) flip and rotation of the inverse, without its scale."""
+        return self._matrix().T / self.scale
+
     def apply_to_points(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """Return A of (n, >=3) points, in the same dtype; further columns stay unchanged."""
         moved = points.copy()

@@ -1,6 +1,5 @@
 """repredict: l' = A^-1 f(A(x); w), and its disagreement with l, the loss L of Eqs. 4 to 11."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,12 +10,13 @@ from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import RecordedViews
 from curate.errors import WorkspaceError
+from curate.geometry.augmentation import Augmentation
 from curate.geometry.similarity import Similarity
 from pipelines.assembly import consistency_settings
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.stages.predict import Predict, checked, detection_columns, visible
-from pipelines.workspace.config import RepredictSection
+from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections]
@@ -59,11 +59,8 @@ class Repredict(Predict):
             views = list(self.detector.views(frame_id))
         else:
             frame = visible(self.dataset.read(frame_id), self.config)
-            drawn = draw(self.seed, self.round_number, frame_id, self.config.repredict)
-            views = [
-                (a, self.detector.predict(frame.with_points(a.apply_to_points(frame.points))))
-                for a in drawn
-            ]
+            copies = augmentation(self.config, self.seed, self.round_number).copies(frame)
+            views = [(a, self.detector.predict(copy)) for a, copy in copies]
         return [(a, self._checked(a, found)) for a, found in views]
 
     def _checked(self, similarity: Similarity, found: Detections) -> Detections:
@@ -72,21 +69,17 @@ class Repredict(Predict):
         return checked(replace(found, boxes=boxes), self.config, self.detector)
 
 
-def draw(
-    seed: int, round_number: int, frame_id: str, section: RepredictSection
-) -> list[Similarity]:
-    """Return the similarities A of a frame, drawn from seed, round and frame id alone."""
-    digest = hashlib.sha256(frame_id.encode()).digest()
-    generator = np.random.default_rng([seed, round_number, *digest])
-    return [
-        Similarity.draw(
-            generator,
-            flip_probability=section.flip_probability,
-            rotation_limit_rad=section.rotation_limit_rad,
-            scale_range=section.scale_range,
-        )
-        for _ in range(section.views)
-    ]
+def augmentation(config: Config, seed: int, round_number: int) -> Augmentation:
+    """Return the augmented copies of a round."""
+    section = config.repredict
+    return Augmentation(
+        seed,
+        round_number,
+        section.views,
+        section.flip_probability,
+        section.rotation_limit_rad,
+        section.scale_range,
+    )
 
 
 def settings(workspace: Workspace, context: RoundContext) -> Settings:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from contracts.samples import assert_one_line, assert_same, sample_of
+from support.copied import TURNED, assert_is_copy, copied
 from support.dataset_layouts import write_toy_folder, write_toy_raw, write_toy_tracking
 from support.nuscenes_scenes import write_nuscenes
 from support.toys import write_toy_kitti
@@ -14,6 +15,7 @@ from support.toys import write_toy_kitti
 from curate.datasets.formats.point_layout import PointLayout
 from curate.errors import DataError
 from curate.frames import Frame
+from curate.geometry.similarity import Similarity
 from pipelines.registry import DATASETS
 
 # Write four frames below a folder, all with label files.
@@ -225,3 +227,26 @@ def test_a_folder_without_a_dataset_is_rejected(
     with pytest.raises(DataError, match="nothing") as caught:
         DATASETS.build(name, tmp_path / "nothing", offered={}, options={}).frame_ids()
     assert_one_line(caught.value)
+
+
+def test_copies_are_a_data_set_of_the_same_frames(dataset, tmp_path: Path) -> None:
+    """Turned copies have the pixels of the frames, and their images; untouched ones are equal."""
+    names = dataset.frame_ids()
+    similarities = dict(zip(names, (TURNED, None), strict=False)) | dict.fromkeys(names[2:], TURNED)
+    again, _ = copied(dataset, tmp_path / "copies", similarities)
+    assert again.frame_ids() == names
+    for name, similarity in similarities.items():
+        frame, copy = (each.read(name, image=True) for each in (dataset, again))
+        assert_is_copy(copy, frame, similarity or Similarity())
+        np.testing.assert_array_equal(copy.image, frame.image)
+
+
+def test_copies_contain_no_ground_truth(dataset, tmp_path: Path) -> None:
+    """Neither label files nor annotations: the copies may be of unlabeled frames."""
+    names = dataset.frame_ids()
+    again, _ = copied(dataset, tmp_path / "copies", dict.fromkeys(names))
+    for name in names:
+        try:
+            assert len(again.annotations(name)) == 0
+        except DataError as error:
+            assert_one_line(error)

@@ -45,7 +45,7 @@ _PCD_IDENTITY = [0.0, 0, 0, 1, 0, 0, 0]  # position, and rotation as a quaternio
 
 
 @dataclass
-class _Element:
+class PlyElement:
     """A PLY element: its row count and properties; with a list property it has no fixed size."""
 
     name: str
@@ -55,7 +55,7 @@ class _Element:
 
 
 @dataclass(frozen=True)
-class _PcdHeader:
+class PcdHeader:
     """The header of a PCD file.
 
     Attributes:
@@ -81,8 +81,8 @@ def read_pcd(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np
         DataError: if the file is malformed, truncated, or has no x, y, z, or several fields may be
             the intensity.
     """
-    lines, start = _header(path, content, "DATA")
-    header = _pcd_header(path, lines)
+    lines, start = split_header(path, content, "DATA")
+    header = parse_pcd_header(path, lines)
     columns = layout.indices(path, header.names)
     if header.encoding == "ascii":
         counts = [header.row[name].shape[0] for name in header.row.names or ()]
@@ -90,8 +90,8 @@ def read_pcd(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np
         table = _parse_numbers(path, content[start:], header.points, sum(counts))
         return table[:, [offsets[column] for column in columns]]
     if header.encoding == "binary_compressed":
-        fields = _decompress_fields(path, content[start:], header.points, header.row)
-        return np.column_stack([fields[column] for column in columns])
+        fields = decompress_fields(path, content[start:], header.points, header.row)
+        return np.column_stack([fields[column][:, 0] for column in columns])
     if header.encoding != "binary":
         raise DataError(
             f"{path}: DATA is {header.encoding[:20]!r}, expected ascii, binary or binary_compressed"
@@ -107,9 +107,9 @@ def read_ply(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np
         DataError: if the file is malformed, truncated, or has no vertices with x, y, z, or several
             properties may be the intensity.
     """
-    lines, start = _header(path, content, "end_header")
+    lines, start = split_header(path, content, "end_header")
     try:
-        order, vertex, before, types = _ply_layout(lines)
+        order, vertex, before, types = ply_layout(lines)
     except (KeyError, IndexError, ValueError):
         raise DataError(
             f"{path}: malformed PLY header, or no vertices of a fixed number of properties"
@@ -127,7 +127,7 @@ def read_ply(path: Path, content: bytes, layout: PointLayout = UNDECLARED) -> np
     return np.column_stack([rows[names[column]] for column in columns])
 
 
-def _header(path: Path, content: bytes, last: str) -> tuple[list[str], int]:
+def split_header(path: Path, content: bytes, last: str) -> tuple[list[str], int]:
     """Return the header lines up to the one that begins with `last`, and the offset of the data.
 
     Only comments may contain other characters than ASCII.
@@ -145,7 +145,7 @@ def _header(path: Path, content: bytes, last: str) -> tuple[list[str], int]:
     raise DataError(f"{path}: not a {path.suffix} file: there is no header that ends with {last}")
 
 
-def _pcd_header(path: Path, lines: Sequence[str]) -> _PcdHeader:
+def parse_pcd_header(path: Path, lines: Sequence[str]) -> PcdHeader:
     """Return the content of a PCD header.
 
     Raises:
@@ -177,7 +177,7 @@ def _pcd_header(path: Path, lines: Sequence[str]) -> _PcdHeader:
         "" if name == _PCD_PADDING or not count else name
         for name, count in zip(names, counts, strict=True)
     ]
-    return _PcdHeader(encoding, points, readable, row)
+    return PcdHeader(encoding, points, readable, row)
 
 
 _folders_with_poses: set[Path] = set()
@@ -209,7 +209,7 @@ def _pcd_points(path: Path, entries: Mapping[str, list[str]]) -> int:
     return points
 
 
-def _ply_layout(lines: Sequence[str]) -> tuple[str, _Element, list[_Element], list[np.dtype]]:
+def ply_layout(lines: Sequence[str]) -> tuple[str, PlyElement, list[PlyElement], list[np.dtype]]:
     """Return byte order, vertex element, the elements before it, and the row types of them all.
 
     Raises:
@@ -230,18 +230,18 @@ def _ply_layout(lines: Sequence[str]) -> tuple[str, _Element, list[_Element], li
     return order, elements[index], elements[:index], types
 
 
-def _elements(lines: Sequence[str]) -> tuple[str, list[_Element]]:
+def _elements(lines: Sequence[str]) -> tuple[str, list[PlyElement]]:
     """Return the byte order of a PLY header, "" for text, and its elements."""
     if lines[0] != "ply":
         raise ValueError(lines[0])
     order: str | None = None
-    elements: list[_Element] = []
+    elements: list[PlyElement] = []
     for words in map(str.split, lines[1:]):
         match words:
             case ["format", encoding, *_]:
                 order = _PLY_ORDERS[encoding]
             case ["element", name, count]:
-                elements.append(_Element(name, _natural(count)))
+                elements.append(PlyElement(name, _natural(count)))
             case ["property", "list", *_]:
                 elements[-1].has_list = True
             case ["property", kind, name]:
@@ -289,8 +289,8 @@ def _rows(path: Path, content: bytes, row: np.dtype, count: int, start: int) -> 
     return np.frombuffer(content, row, count, start) if count else np.zeros(0, row)
 
 
-def _decompress_fields(path: Path, content: bytes, points: int, row: np.dtype) -> list[np.ndarray]:
-    """Return the first column of each field of a compressed PCD.
+def decompress_fields(path: Path, content: bytes, points: int, row: np.dtype) -> list[np.ndarray]:
+    """Return the (points, count) values of each field of a compressed PCD.
 
     The content is the compressed size, the decompressed size, and the compressed bytes. These
     contain one field after the other: all x, then all y, and so on.
@@ -309,7 +309,6 @@ def _decompress_fields(path: Path, content: bytes, points: int, row: np.dtype) -
     for name in row.names or ():
         field_type = row[name]
         end = start + points * field_type.itemsize
-        values = unpacked[start:end].view(field_type.base).reshape(points, *field_type.shape)
-        fields.append(values[:, 0] if values.shape[1] else np.zeros(points))  # COUNT 0: no bytes
+        fields.append(unpacked[start:end].view(field_type.base).reshape(points, *field_type.shape))
         start = end
     return fields

@@ -69,6 +69,7 @@ class KittiDataset:
     """
 
     name = "kitti"
+    copied_as = "kitti"
 
     def __init__(
         self,
@@ -90,7 +91,7 @@ class KittiDataset:
                 f"set the root to a data set in KITTI's layout{layout_hint(self.root, self.name)}"
             )
         self._home = home
-        self._layout = layout
+        self.layout = layout
         self._boundary.check(home / "calib")
         # Converters of data with several cameras write all labels in the frame of camera 0.
         self._front = _has_own_extrinsics(home / "calib")
@@ -195,7 +196,7 @@ class KittiDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_points(files.points, self._layout)
+            sweep = read_points(files.points, self.layout)
         calibration = read_calibration(files.calibration, self.camera, self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)

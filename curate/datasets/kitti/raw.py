@@ -72,6 +72,7 @@ class KittiRawDataset:
     """
 
     name = "kitti-raw"
+    copied_as = "kitti"
 
     def __init__(
         self,
@@ -84,7 +85,7 @@ class KittiRawDataset:
     ) -> None:
         check_rotation_y(rotation_y)
         self.root = Path(root)
-        self._layout = layout
+        self.layout = layout
         self._rotation_y = rotation_y
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._tracklets: dict[Path, TrackletTable] = {}
@@ -155,7 +156,7 @@ class KittiRawDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_points(files.points, self._layout)
+            sweep = read_points(files.points, self.layout)
         calibration = self._calibration(files)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)

@@ -73,6 +73,7 @@ class KittiTrackingDataset:
     """
 
     name = "kitti-tracking"
+    copied_as = "kitti"
 
     def __init__(
         self,
@@ -86,7 +87,7 @@ class KittiTrackingDataset:
         check_rotation_y(rotation_y)
         self._rotation_y = rotation_y
         self.root = Path(root)
-        self._layout = layout
+        self.layout = layout
         self._boundary = Boundary(self.root, follow_links=follow_links)
         self._rows: dict[Path, Mapping[int, Sequence[tuple[int, Sequence[str]]]]] = {}
         homes = [self.root / "training", self.root]
@@ -158,7 +159,7 @@ class KittiTrackingDataset:
         files = self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_points(files.points, self._layout)
+            sweep = read_points(files.points, self.layout)
         calibration = read_calibration(files.calibration, rotation_y=self._rotation_y)
         size, pixels = read_optional_image(files.image, self._image_size, pixels=image)
         return Frame(frame_id, sweep, calibration, size, pixels)

@@ -18,6 +18,7 @@ from curate.datasets.formats.containment import Boundary, check_frame_id
 from curate.datasets.formats.images import read_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.nuscenes.annotations import AnnotationTable
+from curate.datasets.nuscenes.copies import NuScenesCopies
 from curate.datasets.nuscenes.keyframes import (
     FRONT_CAMERA,
     TO_SENSOR_AXES,
@@ -32,6 +33,7 @@ from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Camera, Frame, FrameFiles
+from curate.geometry.similarity import Similarity
 
 _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
@@ -71,7 +73,7 @@ class NuScenesDataset:
     ) -> None:
         self.root = Path(root)
         self._boundary = Boundary(self.root, follow_links=follow_links)
-        self._layout = layout.with_defaults(_COLUMNS, _FULL_INTENSITY)
+        self.layout = layout.with_defaults(_COLUMNS, _FULL_INTENSITY)
         self.version = _version(self.root, version)
         self._tables = self.root / self.version
         self._boundary.check(*self._tables.glob("*.json"))
@@ -192,7 +194,7 @@ class NuScenesDataset:
         frame, files = self._frame(frame_id), self.files(frame_id)
         sweep = np.zeros((0, 4), dtype=np.float32)
         if points:
-            sweep = read_cloud(files.points, self._layout)
+            sweep = read_cloud(files.points, self.layout)
             # For row vectors, p @ R applies the inverse of R: from the sensor's axes to ours.
             sweep[:, :3] = sweep[:, :3] @ TO_SENSOR_AXES[:3, :3].astype(np.float32)
         cameras = frame.cameras
@@ -215,6 +217,14 @@ class NuScenesDataset:
                 f"{self._annotations.path}: no such table; {self.version} has no labels"
             )
         return self._annotations.read(frame_id, self._frame(frame_id).cameras)
+
+    def copy_writer(self, folder: Path, copies: Mapping[str, Similarity | None]) -> NuScenesCopies:
+        """Return the writer of copies of some frames."""
+        return NuScenesCopies(self, self._tables, folder, copies)
+
+    def check_path(self, name: str) -> None:
+        """Raise DataError if the path of a file in the tables leads out of the data set."""
+        self._boundary.check(self.root / name)
 
     def _frame(self, frame_id: str) -> Keyframe:
         check_frame_id(frame_id)

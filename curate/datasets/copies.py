@@ -1,0 +1,264 @@
+"""Copies of frames in another folder, in a layout that readers of the data set open.
+
+Each frame is copied as it is, or as A(x) for a similarity A: see `curate.geometry.augmentation`.
+Frame ids stay, images are links, labels are not copied. Formats of points stay as well, with all
+columns.
+
+| data set | copies are a data set of the kind |
+|---|---|
+| kitti, kitti-raw, kitti-tracking | kitti, in training/, with testing as a second name of it |
+| nuscenes | nuscenes |
+| folder, and a user's own class | folder |
+
+Raw and tracking data have one calibration per recording, but each copy has its own: therefore they
+become a data set of single frames.
+
+    writer = copy_writer(dataset, folder, {"000008": Similarity(flip_y=True), "000009": None})
+    writer.prepare()
+    for frame_id in writer.frame_ids:
+        if not writer.is_written(frame_id):
+            writer.write(frame_id)
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from curate.datasets.base import Dataset
+from curate.datasets.formats.containment import check_frame_id
+from curate.datasets.formats.moved_clouds import move_cloud
+from curate.datasets.formats.point_layout import PointLayout
+from curate.datasets.kitti.calibration import write_calibration
+from curate.files.atomic import replace_file
+from curate.files.links import link_file
+from curate.files.toml_text import toml, toml_key
+from curate.frames import Camera, Frame
+from curate.geometry.augmentation import augmented_frame
+from curate.geometry.similarity import Similarity
+
+Copies = Mapping[str, Similarity | None]
+"""A of each frame, None for a frame that is copied as it is."""
+
+
+class CopyWriter(Protocol):
+    """Writes copies of frames into a folder; every file is written atomically.
+
+    Attributes:
+        kind: kind of data set that the copies are.
+        frame_ids: the frames, sorted.
+    """
+
+    kind: str
+    frame_ids: tuple[str, ...]
+
+    def prepare(self) -> None:
+        """Write the files that all copies share: frame lists, tables, a description.
+
+        Their content depends on the frames and their A only, so several processes may write them.
+        """
+        ...
+
+    def is_written(self, frame_id: str) -> bool:
+        """Return whether the copy of a frame is complete."""
+        ...
+
+    def write(self, frame_id: str) -> None:
+        """Write the copy of a frame; its points are the last file.
+
+        Raises:
+            DataError: if a file of the frame is missing, damaged or malformed.
+        """
+        ...
+
+
+@runtime_checkable
+class Copyable(Protocol):
+    """A data set that writes copies in a layout of its own."""
+
+    def copy_writer(self, folder: Path, copies: Copies) -> CopyWriter:
+        """Return the writer of copies of some frames."""
+        ...
+
+
+@runtime_checkable
+class PointFiles(Protocol):
+    """A data set that reads points with `clouds.read_cloud`, so that their files can be copied.
+
+    Attributes:
+        layout: the layout of the files.
+        copied_as: kind of data set that copies are: kitti or folder.
+    """
+
+    layout: PointLayout
+    copied_as: str
+
+
+def copy_writer(dataset: Dataset, folder: Path, copies: Copies) -> CopyWriter:
+    """Return the writer of copies of some frames of a data set.
+
+    Args:
+        dataset: the data set.
+        folder: root of the copies.
+        copies: A of each frame.
+    """
+    if isinstance(dataset, Copyable) and _is_own(dataset):
+        return dataset.copy_writer(folder, copies)
+    if not isinstance(dataset, PointFiles) or not _is_own(dataset):
+        return FolderCopies(dataset, folder, copies, None)
+    kind = KittiCopies if dataset.copied_as == "kitti" else FolderCopies
+    return kind(dataset, folder, copies, dataset.layout)
+
+
+def _is_own(dataset: Dataset) -> bool:
+    """Return whether a class is one of curate; a derived one may read other points."""
+    return type(dataset).__module__.startswith("curate.")
+
+
+class _Copies:
+    """The common part of copies in folders of points, calibrations and images."""
+
+    def __init__(
+        self, dataset: Dataset, folder: Path, copies: Copies, layout: PointLayout | None
+    ) -> None:
+        self._dataset = dataset
+        self._folder = folder
+        self._copies = copies
+        self._layout = layout  # None if the files of points cannot be copied
+        self.frame_ids = tuple(sorted(copies))
+        for frame_id in self.frame_ids:
+            check_frame_id(frame_id)
+
+    def _points(self, folder: Path, frame_id: str) -> Path:
+        """Return the path of a copy's points in a folder."""
+        suffix = ".bin" if self._layout is None else self._dataset.files(frame_id).points.suffix
+        return folder / f"{frame_id}{suffix}"
+
+    def _read(self, frame_id: str) -> Frame:
+        """Return a copied frame; reading it checks all its files."""
+        frame = self._dataset.read(frame_id)
+        similarity = self._copies[frame_id]
+        return frame if similarity is None else augmented_frame(frame, similarity)
+
+    def _write_points(self, target: Path, copied: Frame) -> None:
+        similarity = self._copies[copied.frame_id]
+        if self._layout is None:
+            replace_file(target, np.ascontiguousarray(copied.points, dtype="<f4").tobytes())
+            return
+        source = self._dataset.files(copied.frame_id).points
+        if similarity is None:
+            link_file(source, target)
+        else:
+            move_cloud(source, target, self._layout, similarity.apply_to_points)
+
+
+class KittiCopies(_Copies):
+    """Copies in the layout of KITTI's object data set.
+
+    The frames are in training/. testing is a link to it, and ImageSets/test.txt lists the frames,
+    because tools take frames without labels from there; train.txt and val.txt are empty.
+    """
+
+    kind = "kitti"
+
+    def __init__(
+        self, dataset: Dataset, folder: Path, copies: Copies, layout: PointLayout | None
+    ) -> None:
+        super().__init__(dataset, folder, copies, layout)
+        self._home = folder / "training"
+        # KITTI's camera of the colour images, unless the data set reads another one.
+        self._camera = int(getattr(dataset, "camera", 2))
+
+    def prepare(self) -> None:
+        """Write the frame lists, and the second name of the folder of frames."""
+        for name in ("velodyne", "calib"):
+            (self._home / name).mkdir(parents=True, exist_ok=True)
+        for name, frames in {"test": self.frame_ids, "train": (), "val": ()}.items():
+            text = "".join(f"{frame}\n" for frame in frames)
+            replace_file(self._folder / "ImageSets" / f"{name}.txt", text.encode())
+        second = self._folder / "testing"
+        if not second.is_symlink():
+            second.symlink_to(self._home.name)
+
+    def is_written(self, frame_id: str) -> bool:
+        """Return whether the copy has points, which are its last file."""
+        return self._points(self._home / "velodyne", frame_id).exists()
+
+    def write(self, frame_id: str) -> None:
+        """Write calibration, image and points of a copy."""
+        copied = self._read(frame_id)
+        write_calibration(self._home / "calib" / f"{frame_id}.txt", copied.calibration)
+        image = self._dataset.files(frame_id).image
+        if image is not None:
+            name = f"{frame_id}{image.suffix}"
+            link_file(image, self._home / f"image_{self._camera}" / name)
+        self._write_points(self._points(self._home / "velodyne", frame_id), copied)
+
+
+class FolderCopies(_Copies):
+    """Copies in a plain folder with dataset.toml, for data of any layout.
+
+    The points of a user's own data set are written as it reads them: x, y, z and intensity.
+    """
+
+    kind = "folder"
+
+    def prepare(self) -> None:
+        """Write dataset.toml and the frame list."""
+        text = "".join(f"{frame}\n" for frame in self.frame_ids)
+        replace_file(self._folder / "ImageSets" / "test.txt", text.encode())
+        (self._folder / "points").mkdir(parents=True, exist_ok=True)
+        replace_file(self._folder / "dataset.toml", self._description().encode())
+
+    def is_written(self, frame_id: str) -> bool:
+        """Return whether the copy has points, which are its last file."""
+        return self._points(self._folder / "points", frame_id).exists()
+
+    def write(self, frame_id: str) -> None:
+        """Write calibrations, images and points of a copy."""
+        copied = self._read(frame_id)
+        images = self._dataset.files(frame_id).images
+        for number, camera in enumerate(copied.cameras):
+            path = self._folder / "calib" / camera.name / f"{frame_id}.txt"
+            write_calibration(path, camera.calibration)
+            if images:
+                image = images[number]
+                name = f"{frame_id}{image.suffix}"
+                link_file(image, self._folder / "images" / camera.name / name)
+        if not copied.cameras and copied.calibration.has_camera:
+            write_calibration(self._folder / "calib" / f"{frame_id}.txt", copied.calibration)
+        self._write_points(self._points(self._folder / "points", frame_id), copied)
+
+    def _description(self) -> str:
+        """Return the content of dataset.toml, from the first frame."""
+        lines = ['points = "points"', 'splits = "ImageSets"']
+        if self._layout is not None:
+            layout = {
+                "columns": None if self._layout.column_names else self._layout.columns,
+                "column_names": self._layout.column_names,
+                "intensity_field": self._layout.intensity_field,
+                "intensity_scale": self._layout.intensity_scale,
+            }
+            lines += [f"{key} = {toml(value)}" for key, value in layout.items() if value]
+        first = self._dataset.read(self.frame_ids[0], points=False)
+        has_images = bool(self._dataset.files(first.frame_id).images)
+        if not first.cameras and first.calibration.has_camera:
+            lines.append('calibration = "calib"')
+        for camera in first.cameras:
+            if camera.name:
+                check_frame_id(camera.name)  # the name of a folder
+            (self._folder / "calib" / camera.name).mkdir(parents=True, exist_ok=True)
+            lines += _camera_table(camera, has_images=has_images)
+        return "\n".join(lines) + "\n"
+
+
+def _camera_table(camera: Camera, *, has_images: bool) -> list[str]:
+    """Return the lines of dataset.toml that describe a camera."""
+    path = f"/{camera.name}" if camera.name else ""
+    images = f"images{path}" if has_images else list(camera.image_size)
+    return [
+        *([f"[cameras.{toml_key(camera.name)}]"] if camera.name else []),
+        f"{'images' if has_images else 'image_size'} = {toml(images)}",
+        f"calibration = {toml(f'calib{path}')}",
+    ]
