@@ -33,13 +33,34 @@ Kind = TypeVar("Kind")
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
-def open_detector(config: Config, path: Path) -> Detector:
-    """Return the configured detector, loaded from a checkpoint, a model or result files."""
+def open_detector(config: Config, path: Path, copies_of: int | None = None) -> Detector:
+    """Return the configured detector, loaded from a checkpoint, a model or result files.
+
+    Args:
+        config: the configuration.
+        path: the checkpoint, model or result files.
+        copies_of: number of a round whose augmented copies it predicts as well. Without it, results
+            in `detector.augmented` are not read.
+    """
     section = config.detector
+    offered = dict(_offered_to_detectors(config))
+    if copies_of is not None:
+        offered["augmented"] = lambda: copies_folder(config, copies_of)
     detector: Detector = registry.DETECTORS.build(
-        section.name, path, offered=_offered_to_detectors(config), options=section.options
+        section.name, path, offered=offered, options=section.options
     )
     return detector
+
+
+def copies_folder(config: Config, round_number: int) -> Path | None:
+    """Return the folder of a round's augmented copies in `detector.augmented`; None if unset."""
+    folder = config.detector.augmented
+    return None if folder is None else fill_round(folder, round_number)
+
+
+def fill_round(folder: Path, round_number: int) -> Path:
+    """Return a folder with the number of the round in place of {round}."""
+    return Path(str(folder).replace("{round}", str(round_number)))
 
 
 def check_detector(config: Config) -> None:
@@ -49,6 +70,13 @@ def check_detector(config: Config) -> None:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
             configured preset.
     """
+    if config.detector.augmented and not registry.DETECTORS.takes(
+        config.detector.name, "augmented"
+    ):
+        raise ConfigError(
+            f"detector.augmented is for recorded results, but detector '{config.detector.name}' "
+            "predicts the copies itself; remove the setting"
+        )
     with error_prefix("detector.name"):
         registry.DETECTORS.check(
             config.detector.name,

@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 import curate
 from curate.errors import CurateError
 from pipelines.commands.audit import audit
+from pipelines.commands.augment import augment
 from pipelines.commands.bench import bench, bench_cell
 from pipelines.commands.check import check
 from pipelines.commands.demo import demo
@@ -39,7 +40,7 @@ from pipelines.commands.view import view
 
 GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
     "Set up": (simulate, demo, init, doctor, check, status, graph),
-    "Stages": (pretrain, predict, repredict, score, solve, export, train_round, run),
+    "Stages": (pretrain, predict, augment, repredict, score, solve, export, train_round, run),
     "Look and ask": (query, explain, view, report, diff, serve, review),
     "Measure": (evaluate, audit, bench),
 }

@@ -8,6 +8,7 @@ from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import is_pretrained, open_round
 from pipelines.engine.stage import FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import export, predict, pretrain, repredict, score, solve, train_round
+from pipelines.stages.copies import check_copies
 from pipelines.workspace.config import DEFAULT_PRIORS
 from pipelines.workspace.workspace import Workspace
 
@@ -41,6 +42,7 @@ _DETECT = (
         settings=repredict.settings,
         function=repredict.function,
         check=predict.check,
+        ready=check_copies,
     ),
 )
 _DECIDE = (

@@ -1,6 +1,6 @@
 """Copies of frames in another folder, in a layout that readers of the data set open.
 
-Each frame is copied as it is, or as A(x) for a similarity A: see `curate.geometry.augmentation`.
+Each frame is copied as it is, or as A(x) for a similarity A: see `curate.geometry.augmented_views`.
 Frame ids stay, images are links, labels are not copied. Formats of points stay as well, with all
 columns.
 
@@ -35,7 +35,7 @@ from curate.files.atomic import replace_file
 from curate.files.links import link_file
 from curate.files.toml_text import toml, toml_key
 from curate.frames import Camera, Frame
-from curate.geometry.augmentation import augmented_frame
+from curate.geometry.augmented_views import augmented_frame
 from curate.geometry.similarity import Similarity
 
 Copies = Mapping[str, Similarity | None]
@@ -109,6 +109,11 @@ def copy_writer(dataset: Dataset, folder: Path, copies: Copies) -> CopyWriter:
         return FolderCopies(dataset, folder, copies, None)
     kind = KittiCopies if dataset.copied_as == "kitti" else FolderCopies
     return kind(dataset, folder, copies, dataset.layout)
+
+
+def copy_kind(dataset: Dataset) -> str:
+    """Return the kind of data set that copies are."""
+    return copy_writer(dataset, Path(), {}).kind
 
 
 def _is_own(dataset: Dataset) -> bool:

@@ -16,6 +16,7 @@ from curate.evaluation.examination import Finding, examine_detections, examine_f
 from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
+from curate.geometry.augmented_views import augmented_frame
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.assessment.missing_results import describe_missing_results
@@ -128,7 +129,7 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
             else _no_views(config)
         )
         for similarity, detections in views:
-            augmented = seen.with_points(similarity.apply_to_points(seen.points))
+            augmented = augmented_frame(seen, similarity)
             findings += [
                 finding
                 for finding in examine_detections(augmented, detections, ())
@@ -186,8 +187,8 @@ def _no_views(config: Config) -> Finding:
     return Finding(
         "views",
         "suspect",
-        "no second pass over augmented copies, so no label has a consistency loss: set passes in "
-        "detector.options, or set solve.self_paced = false",
+        "no second pass over augmented copies, so no label has a consistency loss: write them with "
+        "`curate augment` and set detector.augmented, or set solve.self_paced = false",
     )
 
 

@@ -32,7 +32,7 @@ def run_frame_command(
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import open_round, preview_round
-    from pipelines.engine.runner import open_executor, run_frames
+    from pipelines.engine.runner import check_inputs, open_executor, run_frames
     from pipelines.round import graph_of
     from pipelines.workspace.splits import SPLITS
 
@@ -53,11 +53,13 @@ def run_frame_command(
             stage.check(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
+        check_inputs(Plan(workspace, context, graph), selected, split)
         preview = Preview(workspace, graph, context.number, context)
         planned = (preview.frames_stage(stage, split, alone=True) for stage in selected)
         print_preview(planned, as_json=as_json)
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
+    check_inputs(plan, selected, split)
     reports = []
     with open_executor(workspace) as work:
         for stage in selected:

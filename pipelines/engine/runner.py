@@ -36,6 +36,7 @@ from pipelines.engine.stage import (
     ReusableMeasurements,
     RoundJob,
     SequenceStage,
+    Stage,
 )
 from pipelines.workspace.workspace import Workspace
 
@@ -86,6 +87,19 @@ def open_executor(workspace: Workspace) -> Iterator[Executor]:
         yield executor
     finally:
         executor.close()
+
+
+def check_inputs(plan: Plan, stages: Iterable[Stage], split: str = "unlabeled") -> None:
+    """Check the input of stages that have work, before any of them runs.
+
+    Raises:
+        CurateError: if it is missing or wrong.
+    """
+    for stage in stages:
+        if isinstance(stage, FramesStage) and stage.ready:
+            counts = plan.counts(stage, split)
+            if counts.waiting or counts.failed:
+                stage.ready(plan.workspace, plan.context, split)
 
 
 def run_frames(

@@ -7,7 +7,14 @@ from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_student_trained, open_round
-from pipelines.engine.runner import Report, open_executor, run_first, run_frames, run_round
+from pipelines.engine.runner import (
+    Report,
+    check_inputs,
+    open_executor,
+    run_first,
+    run_frames,
+    run_round,
+)
 from pipelines.engine.stage import FramesStage, RoundStage
 from pipelines.workspace.workspace import Workspace
 
@@ -44,6 +51,8 @@ def run_all(
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
             plan = Plan(workspace, open_round(workspace, number, rounds), graph)
+            if evidence:
+                check_inputs(plan, graph.stages)
             for stage in graph.stages:
                 if isinstance(stage, FramesStage) and evidence:
                     yield run_frames(plan, stage, executor, progress)

@@ -142,11 +142,13 @@ class _FramesStage(_Stage):
         settings: function that returns the settings that its rows depend on, without those of
             its reusable measurements.
         check: check of its settings before the first frame; raises an error.
+        ready: check of the input of a split in a round before the first frame; raises an error.
         prepare: function that creates the tables it writes to, if they are missing.
     """
 
     settings: Callable[[Workspace, RoundContext], Settings]
     check: Callable[[Workspace], None] | None = None
+    ready: Callable[[Workspace, RoundContext, str], None] | None = None
     prepare: Callable[[Workspace], None] | None = None
 
 

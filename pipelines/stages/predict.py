@@ -30,15 +30,17 @@ class Predict:
     Attributes:
         config: the configuration.
         teacher: checkpoint of the teacher.
+        copies_of: see `open_detector`.
     """
 
     config: Config
     teacher: Path
+    copies_of: int | None = None
 
     def open(self) -> None:
         """Open the data set and load the detector."""
         self.dataset = open_dataset(self.config)
-        self.detector = open_detector(self.config, self.teacher)
+        self.detector = open_detector(self.config, self.teacher, self.copies_of)
         check_detector_names(self.config, self.detector)
 
     def __call__(self, job: FrameJob) -> FrameRows:
@@ -144,7 +146,7 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     config = workspace.config
     return {
         "detector": config.detector.model_dump(
-            mode="json", exclude={"path", *unset_rename(config.detector)}
+            mode="json", exclude={"path", "augmented", *unset_rename(config.detector)}
         ),
         "files": option_files(config),
         "categories": config.dataset.categories,

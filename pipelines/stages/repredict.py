@@ -10,13 +10,12 @@ from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import RecordedViews
 from curate.errors import WorkspaceError
-from curate.geometry.augmentation import Augmentation
 from curate.geometry.similarity import Similarity
-from pipelines.assembly import consistency_settings
+from pipelines.assembly import consistency_settings, copies_folder
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
+from pipelines.stages.copies import augmented_views, copies_fingerprint
 from pipelines.stages.predict import Predict, checked, detection_columns, visible
-from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections]
@@ -26,7 +25,7 @@ class Repredict(Predict):
     """Predicts augmented copies of a frame, and compares them with the frame's predictions."""
 
     def __init__(self, predict: Predict, seed: int, round_number: int) -> None:
-        super().__init__(predict.config, predict.teacher)
+        super().__init__(predict.config, predict.teacher, round_number)
         self.seed = seed
         self.round_number = round_number
 
@@ -59,7 +58,7 @@ class Repredict(Predict):
             views = list(self.detector.views(frame_id))
         else:
             frame = visible(self.dataset.read(frame_id), self.config)
-            copies = augmentation(self.config, self.seed, self.round_number).copies(frame)
+            copies = augmented_views(self.config, self.seed, self.round_number).copies(frame)
             views = [(a, self.detector.predict(copy)) for a, copy in copies]
         return [(a, self._checked(a, found)) for a, found in views]
 
@@ -69,23 +68,12 @@ class Repredict(Predict):
         return checked(replace(found, boxes=boxes), self.config, self.detector)
 
 
-def augmentation(config: Config, seed: int, round_number: int) -> Augmentation:
-    """Return the augmented copies of a round."""
-    section = config.repredict
-    return Augmentation(
-        seed,
-        round_number,
-        section.views,
-        section.flip_probability,
-        section.rotation_limit_rad,
-        section.scale_range,
-    )
-
-
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
     """Return what repredictions depend on besides predictions and teacher."""
     section = workspace.config.repredict.model_dump(mode="json")
-    return {**section, "seed": context.seed, "round": context.number}
+    folder = copies_folder(workspace.config, context.number)
+    copies = {} if folder is None else {"copies": copies_fingerprint(folder)}
+    return {**section, **copies, "seed": context.seed, "round": context.number}
 
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:

@@ -185,6 +185,13 @@ class DetectorSection(Section):
         "trains the first teacher.",
         examples=["results/predictions.pkl"],
     )
+    augmented: Path | None = Field(
+        default=None,
+        description="Folder of `curate augment` with the results of the copies, for recorded "
+        "results. {round} stands for the number of the round; a relative path starts at the "
+        "workspace.",
+        examples=["copies/round-{round}"],
+    )
     device: Literal["auto", "cpu", "cuda"] = Field(
         default="auto",
         description="Where the detector runs and trains. 'auto' uses a GPU if there is one.",

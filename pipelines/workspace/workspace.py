@@ -217,11 +217,13 @@ def stat_fingerprint(path: Path) -> str:
 def _anchored(root: Path, config: Config) -> Config:
     """Return the configuration with relative paths resolved against the workspace folder."""
     changes: dict[str, Any] = {}
-    for name, key in (("dataset", "root"), ("detector", "path"), ("segmenter", "path")):
+    paths = {"dataset": ("root",), "detector": ("path", "augmented"), "segmenter": ("path",)}
+    for name, keys in paths.items():
         section = getattr(config, name)
-        path = getattr(section, key)
-        if path is not None:
-            changes[name] = section.model_copy(update={key: root / path})
+        found = {key: getattr(section, key) for key in keys}
+        update = {key: root / path for key, path in found.items() if path is not None}
+        if update:
+            changes[name] = section.model_copy(update=update)
     return config.model_copy(update=changes)
 
 

@@ -30,7 +30,7 @@ from curate.datasets.nuscenes.tables import (
 from curate.files.atomic import replace_file
 from curate.files.links import link_file
 from curate.frames import Calibration
-from curate.geometry.augmentation import augmented_calibration
+from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.poses import invert_pose
 from curate.geometry.similarity import Similarity
 

@@ -1,7 +1,7 @@
 """Detector that returns stored predictions."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from curate.datasets.frame_names import FrameNames, last_part
 from curate.datasets.kitti.labels import KittiObjects, to_detections
+from curate.datasets.manifest import Manifest, results_of
 from curate.detections import Detections, as_categories
 from curate.detectors.recorded.argoverse2 import check_frame_name
 from curate.detectors.recorded.formats import check_kind, detect_kind
@@ -25,6 +26,7 @@ from curate.detectors.scores import describe_invalid_scores, to_probabilities
 from curate.errors import ConfigError, DataError, error_prefix
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, RotationY
+from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
 from curate.warnings_once import warn_once
@@ -105,6 +107,7 @@ class RecordedDetector:
         shift: SHIFT_COOR of ST3D's data set configuration, [x, y, z] in metres.
         frame_name: name of a frame of Argoverse 2, e.g. "{log_id}_{timestamp_ns}".
         sigmoid: whether scores are logits; they become probabilities first.
+        augmented: folder of `curate augment` with results of the copies; in place of `passes`.
         frame_ids: the frames of the data set; recorded frames are matched with them in the
             spellings of `curate.datasets.frame_names`, and those of no frame are reported.
         calibration: returns the calibration of a frame id; needed for views in the formats of
@@ -133,6 +136,7 @@ class RecordedDetector:
         shift: Sequence[float] = (0.0, 0.0, 0.0),
         frame_name: str | None = None,
         sigmoid: bool = False,
+        augmented: StrPath | None = None,
         frame_ids: Sequence[str] = (),
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
@@ -160,6 +164,35 @@ class RecordedDetector:
         found = self._match(FrameNames.of(frame_ids))
         self._record.check(found)
         self._recorded_as = {frame: name for name, frame in found.items() if name != frame}
+        self._copies: _Copies | None = None
+        if augmented is not None:
+            if self._record.has_views:
+                raise ConfigError(
+                    f"{self.path}: has augmented copies of its own, and detector.augmented is set; "
+                    "remove one of them"
+                )
+            folder = Path(augmented)
+            manifest = Manifest.read(folder)
+            places = [results_of(view, folder) for view in range(manifest.drawn.views)]
+            views = [
+                RecordedDetector(
+                    place,
+                    minimum_score,
+                    kind=kind,
+                    classes=classes,
+                    frame_list=_list_of_view(place, frame_list),
+                    rename=rename,
+                    axes=axes,
+                    version=version,
+                    ignored=ignored,
+                    shift=shift,
+                    frame_name=frame_name,
+                    sigmoid=sigmoid,
+                    frame_ids=frame_ids,
+                )
+                for place in places
+            ]
+            self._copies = _Copies(folder, manifest, views)
 
     def frame_ids(self) -> tuple[str, ...]:
         """Return the recorded frames, in sorted order, by the names that the record gives them."""
@@ -172,6 +205,11 @@ class RecordedDetector:
             frame for frame in frame_ids if self._recorded_as.get(frame, frame) not in recorded
         )
 
+    @property
+    def views_of_copies(self) -> "Sequence[RecordedDetector]":
+        """The results of each view of a folder of augmented copies; empty without one."""
+        return self._copies.views if self._copies else ()
+
     def category_names(self) -> frozenset[str]:
         """Return the category names of all recorded boxes, after `rename`.
 
@@ -179,7 +217,8 @@ class RecordedDetector:
             DataError: if a file cannot be read.
         """
         names = self._record.category_names()
-        return frozenset(self.rename.get(name, name) for name in names)
+        own = frozenset(self.rename.get(name, name) for name in names)
+        return own.union(*(view.category_names() for view in self.views_of_copies))
 
     def predict(self, frame: Frame) -> Detections:
         """Return the stored result of the original frame; `frame.points` is not used.
@@ -187,9 +226,7 @@ class RecordedDetector:
         Raises:
             DataError: if the frame was not recorded, or its result is malformed.
         """
-        name = self._recorded_as.get(frame.frame_id, frame.frame_id)
-        result = self._record.result(name)
-        return self._detections(frame.frame_id, result, lambda _: frame.calibration)
+        return self._found(frame.frame_id, lambda _: frame.calibration)
 
     def views(self, frame_id: str) -> Sequence[tuple[Similarity, Detections]]:
         """Return the recorded augmented copies of the frame, in the order of their numbers.
@@ -197,28 +234,70 @@ class RecordedDetector:
         Raises:
             DataError: if the frame was not recorded, or its result is malformed.
         """
+        if self._copies:
+            return [
+                (similarity, self.found_in_copy(frame_id, view))
+                for view, similarity in enumerate(self._copies.of(frame_id))
+            ]
         views = self._record.views(self._recorded_as.get(frame_id, frame_id))
         if self._wants_views and not views and not self._record.has_views:
             warn_once(
                 f"{self.path}: no second pass over augmented copies, so no label has a consistency "
                 "loss. Methods that need one give every label weight 0 unless solve.self_paced = "
-                "false. Add the second pass under passes in detector.options"
+                "false. Write the copies with `curate augment`, and set detector.augmented"
             )
         return [
-            (similarity, self._detections(frame_id, result, self._calibration))
+            (similarity, self._detections(frame_id, result, self._own_calibration))
             for similarity, result in views
         ]
+
+    def predict_recorded(self, frame_id: str) -> Detections:
+        """Return the stored result of a frame by its name; see `predict`."""
+        return self._found(frame_id, self._own_calibration)
+
+    def found_in_copy(
+        self, frame_id: str, view: int, rotation_y: RotationY | None = None
+    ) -> Detections:
+        """Return the detections of an augmented copy, in the copy's frame of reference.
+
+        Args:
+            frame_id: the frame.
+            view: number of the copy, from 0.
+            rotation_y: meaning of rotation_y in place of the configured one.
+
+        Raises:
+            DataError: if the copy was not recorded, or its result is malformed.
+            ConfigError: if there is no folder of augmented copies.
+        """
+        if self._copies is None:
+            raise ConfigError(f"{self.path}: detector.augmented is not set")
+        similarity = self._copies.of(frame_id)[view]
+        meaning = rotation_y or self._rotation_y or self._copies.manifest.rotation_y
+
+        def calibration(name: str) -> Calibration:
+            copied = augmented_calibration(self._own_calibration(name), similarity)
+            return replace(copied, rotation_y=meaning)
+
+        return self._copies.views[view]._found(frame_id, calibration)  # noqa: SLF001 - same class
+
+    def _own_calibration(self, frame_id: str) -> Calibration:
+        if self._calibration is None:
+            raise ConfigError(f"{self.path}: these results need the calibration of the frames")
+        return self._calibration(frame_id)
+
+    def _found(self, frame_id: str, calibration: Callable[[str], Calibration]) -> Detections:
+        """Return the stored result of a frame, or of a copy with this calibration."""
+        result = self._record.result(self._recorded_as.get(frame_id, frame_id))
+        return self._detections(frame_id, result, calibration)
 
     def _detections(
         self,
         frame_id: str,
         result: RecordedResult,
-        calibration: Callable[[str], Calibration] | None,
+        calibration: Callable[[str], Calibration],
     ) -> Detections:
         """Return a result in the LiDAR frame, with renamed categories, without low scores."""
         if not isinstance(result, Detections):
-            if calibration is None:
-                raise ConfigError(f"{self.path}: these results need the calibration of the frames")
             result = self._in_lidar(frame_id, result, calibration(frame_id))
         elif self._to_lidar_axes != Similarity():
             result = replace(result, boxes=self._to_lidar_axes.apply_to_boxes(result.boxes))
@@ -270,6 +349,32 @@ class RecordedDetector:
                 f"data set does not have ({examples}); they are left out"
             )
         return found
+
+
+@dataclass(frozen=True)
+class _Copies:
+    """The results of augmented copies: the folder, its manifest, and a detector per view."""
+
+    folder: Path
+    manifest: Manifest
+    views: Sequence[RecordedDetector]
+
+    def of(self, frame_id: str) -> Sequence[Similarity]:
+        """Return A of each copy of a frame."""
+        if frame_id not in self.manifest.frames:
+            raise DataError(
+                f"{self.folder}: no copies of frame {frame_id}; these are copies of the split "
+                f"{self.manifest.split}"
+            )
+        return self.manifest.frames[frame_id]
+
+
+def _list_of_view(results: Path, frame_list: str | None) -> str | None:
+    """Return the list of frames of a view's results: beside them, or that of the copies."""
+    if frame_list is None:
+        return None
+    own = Path(frame_list).name
+    return own if (results.parent / own).exists() else "ImageSets/test.txt"
 
 
 def _check_repeated(place: str, found: Detections) -> None:

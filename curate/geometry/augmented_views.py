@@ -22,7 +22,7 @@ from curate.geometry.similarity import Similarity
 
 
 @dataclass(frozen=True)
-class Augmentation:
+class AugmentedViews:
     """The augmented copies of a round; the same values give the same copies.
 
     Attributes:

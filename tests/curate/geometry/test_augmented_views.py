@@ -8,7 +8,7 @@ from support.rigs import IMAGE_SIZE, Rig, rigs
 
 from curate.errors import ConfigError
 from curate.frames import Camera, Frame, calibration_without_camera
-from curate.geometry.augmentation import Augmentation, augmented_calibration, augmented_frame
+from curate.geometry.augmented_views import AugmentedViews, augmented_calibration, augmented_frame
 from curate.geometry.mounting import check_lidar_to_camera
 from curate.geometry.projection import in_camera_view, project_points
 from curate.geometry.similarity import Similarity
@@ -52,17 +52,17 @@ def test_data_without_a_camera_keep_their_calibration() -> None:
 
 def test_draws_depend_on_seed_round_and_frame_only() -> None:
     """The first views are the same whatever their number."""
-    many = Augmentation(3, 2, views=4).draw("000008")
-    assert Augmentation(3, 2, views=2).draw("000008") == many[:2]
+    many = AugmentedViews(3, 2, views=4).draw("000008")
+    assert AugmentedViews(3, 2, views=2).draw("000008") == many[:2]
     assert len(set(many)) == 4
-    for other in (Augmentation(4, 2), Augmentation(3, 1)):
+    for other in (AugmentedViews(4, 2), AugmentedViews(3, 1)):
         assert other.draw("000008")[0] != many[0]
-    assert Augmentation(3, 2).draw("000009")[0] != many[0]
+    assert AugmentedViews(3, 2).draw("000009")[0] != many[0]
 
 
 def test_draws_of_a_released_version_stay() -> None:
     """Stored repredictions and written copies remain valid."""
-    [found] = Augmentation(0, 1).draw("000008")
+    [found] = AugmentedViews(0, 1).draw("000008")
     assert found == Similarity(False, -0.1356736284075849, 0.9841801979172125)
 
 
@@ -76,4 +76,4 @@ def test_draws_of_a_released_version_stay() -> None:
 def test_invalid_values_are_rejected(wrong: dict) -> None:
     """With their values in the message."""
     with pytest.raises(ConfigError, match=r"copies (of|with)"):
-        Augmentation(**wrong)
+        AugmentedViews(**wrong)

@@ -1,0 +1,127 @@
+"""Do recorded results belong to the augmented copies for which they are given?
+
+Boxes found in the copy A(x), mapped back by A^-1, lie where those of x lie, whatever the detector
+missed. Over many frames, results of other clouds match better under another transform:
+
+| best match | what happened |
+|---|---|
+| by A^-1 of this view | nothing, the results belong to the copies |
+| as they are | the detector ran on x, or the boxes were mapped back already |
+| by A^-1 of another view | results of another view |
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from curate.consistency import match
+from curate.detections import Detections
+from curate.frames import RotationY
+from curate.geometry.similarity import Similarity, wrap_angle
+
+# So many boxes of the frames must match in some way before anything is concluded.
+_LEAST_MATCHES = 20
+# Another transform must match so many times as many boxes.
+_MARGIN = 1.5
+_MINIMUM_IOU = 0.1
+# Headings of one object agree to a few degrees, apart from half turns. Copies are turned by up to
+# a quarter of pi and more, and results read in a wrong meaning of rotation_y by the same angle.
+_WRONG_HEADING_RAD, _GOOD_HEADING_RAD = np.deg2rad(8), np.deg2rad(5)
+
+
+@dataclass(frozen=True)
+class CopiedFrame:
+    """The detections of a frame and of one of its copies.
+
+    Attributes:
+        plain: detections of the frame x.
+        copy: detections of the copy, in its frame of reference.
+        similarities: A of every view of the frame.
+    """
+
+    plain: Detections
+    copy: Detections
+    similarities: Sequence[Similarity]
+
+
+def examine_copies(view: int, frames: Sequence[CopiedFrame]) -> str:
+    """Return what is wrong with the results of a view; "" if nothing is.
+
+    Args:
+        view: number of the view, from 0.
+        frames: some frames.
+    """
+    views = len(frames[0].similarities) if frames else 0
+    by_view = [_matches(frames, [frame.similarities[k] for frame in frames]) for k in range(views)]
+    own = by_view[view] if frames else 0
+    untouched = _matches(frames, [Similarity()] * len(frames))
+    total = sum(len(frame.plain) for frame in frames)
+    best = max(untouched, *by_view, 0)
+    if best < _LEAST_MATCHES or best <= _MARGIN * own:
+        return ""
+    if best == untouched:
+        return (
+            f"{untouched} of {total} boxes lie where those of the original frames lie, but only "
+            f"{own} do after A^-1: these are results of the original frames, or their boxes were "
+            "mapped back already; run the detector on the copies, and leave its boxes as they are"
+        )
+    other = by_view.index(best) + 1
+    return f"these are results of view-{other} ({best} of {total} boxes match, {own} here)"
+
+
+def examine_copied_headings(
+    view: int,
+    frames: Sequence[CopiedFrame],
+    read_as: Callable[[RotationY], Sequence[CopiedFrame]],
+) -> str:
+    """Return what is wrong with the headings of a view; "" if nothing is.
+
+    Args:
+        view: number of the view, from 0.
+        frames: some frames.
+        read_as: returns the same frames with results read in another meaning of rotation_y.
+    """
+    errors = _heading_errors(view, frames)
+    if len(errors) < _LEAST_MATCHES or np.median(errors) < _WRONG_HEADING_RAD:
+        return ""
+    degrees = np.rad2deg(np.median(errors))
+    meanings: tuple[RotationY, ...] = ("openpcdet", "calibration", "nuscenes")
+    for meaning in meanings:
+        if np.median(_heading_errors(view, read_as(meaning))) < _GOOD_HEADING_RAD:
+            return (
+                f"headings differ from those of the original frames by {degrees:.0f} degrees, but "
+                f'not if rotation_y is read as "{meaning}"; set detector.options.rotation_y = '
+                f'"{meaning}"'
+            )
+    return (
+        f"headings differ from those of the original frames by {degrees:.0f} degrees; were the "
+        "boxes turned back in part?"
+    )
+
+
+def _matches(frames: Sequence[CopiedFrame], similarities: Sequence[Similarity]) -> int:
+    """Return how many boxes of x match boxes of the copies that are mapped back by A^-1."""
+    pairs = zip(frames, similarities, strict=True)
+    return sum(int((_matched(frame, similarity) >= 0).sum()) for frame, similarity in pairs)
+
+
+def _matched(frame: CopiedFrame, similarity: Similarity) -> np.ndarray:
+    """Return (n,) the box of the copy that matches each box of x, -1 for none."""
+    back = replace(frame.copy, boxes=similarity.invert_boxes(frame.copy.boxes))
+    return match(frame.plain, back, _MINIMUM_IOU)[0]
+
+
+def _heading_errors(view: int, frames: Sequence[CopiedFrame]) -> np.ndarray:
+    """Return the differences of matched headings apart from half turns, of longish boxes."""
+    found = [np.zeros(0)]
+    for frame in frames:
+        similarity = frame.similarities[view]
+        matched = _matched(frame, similarity)
+        rows = np.flatnonzero(matched >= 0)
+        boxes = similarity.invert_boxes(frame.copy.boxes)[matched[rows]]
+        plain = frame.plain.boxes[rows]
+        is_long = plain[:, 3] > 1.3 * plain[:, 4]
+        difference = wrap_angle(2 * (boxes[:, 6] - plain[:, 6])) / 2
+        found.append(np.abs(difference)[is_long])
+    return np.concatenate(found)
