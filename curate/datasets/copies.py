@@ -28,7 +28,7 @@ import numpy as np
 
 from curate.datasets.base import Dataset
 from curate.datasets.formats.containment import check_frame_id
-from curate.datasets.formats.moved_clouds import move_cloud
+from curate.datasets.formats.moved_clouds import Keep, move_cloud
 from curate.datasets.formats.point_layout import PointLayout
 from curate.datasets.kitti.calibration import write_calibration
 from curate.files.atomic import replace_file
@@ -36,6 +36,7 @@ from curate.files.links import link_file
 from curate.files.toml_text import toml, toml_key
 from curate.frames import Camera, Frame
 from curate.geometry.augmented_views import augmented_frame
+from curate.geometry.projection import in_camera_view
 from curate.geometry.similarity import Similarity
 
 Copies = Mapping[str, Similarity | None]
@@ -77,7 +78,7 @@ class CopyWriter(Protocol):
 class Copyable(Protocol):
     """A data set that writes copies in a layout of its own."""
 
-    def copy_writer(self, folder: Path, copies: Copies) -> CopyWriter:
+    def copy_writer(self, folder: Path, copies: Copies, *, camera_view: bool) -> CopyWriter:
         """Return the writer of copies of some frames."""
         ...
 
@@ -95,20 +96,23 @@ class PointFiles(Protocol):
     copied_as: str
 
 
-def copy_writer(dataset: Dataset, folder: Path, copies: Copies) -> CopyWriter:
+def copy_writer(
+    dataset: Dataset, folder: Path, copies: Copies, *, camera_view: bool = False
+) -> CopyWriter:
     """Return the writer of copies of some frames of a data set.
 
     Args:
         dataset: the data set.
         folder: root of the copies.
         copies: A of each frame.
+        camera_view: whether only the points that a camera sees are written.
     """
     if isinstance(dataset, Copyable) and _is_own(dataset):
-        return dataset.copy_writer(folder, copies)
+        return dataset.copy_writer(folder, copies, camera_view=camera_view)
     if not isinstance(dataset, PointFiles) or not _is_own(dataset):
-        return FolderCopies(dataset, folder, copies, None)
+        return FolderCopies(dataset, folder, copies, None, camera_view=camera_view)
     kind = KittiCopies if dataset.copied_as == "kitti" else FolderCopies
-    return kind(dataset, folder, copies, dataset.layout)
+    return kind(dataset, folder, copies, dataset.layout, camera_view=camera_view)
 
 
 def copy_kind(dataset: Dataset) -> str:
@@ -125,9 +129,16 @@ class _Copies:
     """The common part of copies in folders of points, calibrations and images."""
 
     def __init__(
-        self, dataset: Dataset, folder: Path, copies: Copies, layout: PointLayout | None
+        self,
+        dataset: Dataset,
+        folder: Path,
+        copies: Copies,
+        layout: PointLayout | None,
+        *,
+        camera_view: bool,
     ) -> None:
         self._dataset = dataset
+        self._camera_view = camera_view
         self._folder = folder
         self._copies = copies
         self._layout = layout  # None if the files of points cannot be copied
@@ -140,22 +151,24 @@ class _Copies:
         suffix = ".bin" if self._layout is None else self._dataset.files(frame_id).points.suffix
         return folder / f"{frame_id}{suffix}"
 
-    def _read(self, frame_id: str) -> Frame:
-        """Return a copied frame; reading it checks all its files."""
-        frame = self._dataset.read(frame_id)
-        similarity = self._copies[frame_id]
+    def _calibrated(self, frame: Frame) -> Frame:
+        """Return a frame with the calibrations of its copy."""
+        similarity = self._copies[frame.frame_id]
         return frame if similarity is None else augmented_frame(frame, similarity)
 
-    def _write_points(self, target: Path, copied: Frame) -> None:
-        similarity = self._copies[copied.frame_id]
+    def _write_points(self, target: Path, frame: Frame) -> None:
+        """Write the points of a frame's copy."""
+        similarity = self._copies[frame.frame_id]
+        move = (similarity or Similarity()).apply_to_points
+        keep = view_of(frame) if self._camera_view else None
+        source = self._dataset.files(frame.frame_id).points
         if self._layout is None:
-            replace_file(target, np.ascontiguousarray(copied.points, dtype="<f4").tobytes())
-            return
-        source = self._dataset.files(copied.frame_id).points
-        if similarity is None:
+            points = frame.points if keep is None else frame.points[keep(frame.points)]
+            replace_file(target, np.ascontiguousarray(move(points), dtype="<f4").tobytes())
+        elif similarity is None and keep is None:
             link_file(source, target)
         else:
-            move_cloud(source, target, self._layout, similarity.apply_to_points)
+            move_cloud(source, target, self._layout, move, keep)
 
 
 class KittiCopies(_Copies):
@@ -167,13 +180,14 @@ class KittiCopies(_Copies):
 
     kind = "kitti"
 
-    def __init__(
-        self, dataset: Dataset, folder: Path, copies: Copies, layout: PointLayout | None
-    ) -> None:
-        super().__init__(dataset, folder, copies, layout)
-        self._home = folder / "training"
-        # KITTI's camera of the colour images, unless the data set reads another one.
-        self._camera = int(getattr(dataset, "camera", 2))
+    @property
+    def _home(self) -> Path:
+        return self._folder / "training"
+
+    @property
+    def _camera(self) -> int:
+        """KITTI's camera of the colour images, unless the data set reads another one."""
+        return int(getattr(self._dataset, "camera", 2))
 
     def prepare(self) -> None:
         """Write the frame lists, and the second name of the folder of frames."""
@@ -192,13 +206,14 @@ class KittiCopies(_Copies):
 
     def write(self, frame_id: str) -> None:
         """Write calibration, image and points of a copy."""
-        copied = self._read(frame_id)
+        frame = self._dataset.read(frame_id)  # checks all its files
+        copied = self._calibrated(frame)
         write_calibration(self._home / "calib" / f"{frame_id}.txt", copied.calibration)
         image = self._dataset.files(frame_id).image
         if image is not None:
             name = f"{frame_id}{image.suffix}"
             link_file(image, self._home / f"image_{self._camera}" / name)
-        self._write_points(self._points(self._home / "velodyne", frame_id), copied)
+        self._write_points(self._points(self._home / "velodyne", frame_id), frame)
 
 
 class FolderCopies(_Copies):
@@ -222,7 +237,8 @@ class FolderCopies(_Copies):
 
     def write(self, frame_id: str) -> None:
         """Write calibrations, images and points of a copy."""
-        copied = self._read(frame_id)
+        frame = self._dataset.read(frame_id)  # checks all its files
+        copied = self._calibrated(frame)
         images = self._dataset.files(frame_id).images
         for number, camera in enumerate(copied.cameras):
             path = self._folder / "calib" / camera.name / f"{frame_id}.txt"
@@ -233,7 +249,7 @@ class FolderCopies(_Copies):
                 link_file(image, self._folder / "images" / camera.name / name)
         if not copied.cameras and copied.calibration.has_camera:
             write_calibration(self._folder / "calib" / f"{frame_id}.txt", copied.calibration)
-        self._write_points(self._points(self._folder / "points", frame_id), copied)
+        self._write_points(self._points(self._folder / "points", frame_id), frame)
 
     def _description(self) -> str:
         """Return the content of dataset.toml, from the first frame."""
@@ -256,6 +272,11 @@ class FolderCopies(_Copies):
             (self._folder / "calib" / camera.name).mkdir(parents=True, exist_ok=True)
             lines += _camera_table(camera, has_images=has_images)
         return "\n".join(lines) + "\n"
+
+
+def view_of(frame: Frame) -> Keep:
+    """Return the function that selects the points that a camera of the frame sees."""
+    return lambda points: in_camera_view(frame.with_points(points))
 
 
 def _camera_table(camera: Camera, *, has_images: bool) -> list[str]:

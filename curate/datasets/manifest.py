@@ -41,6 +41,7 @@ class Manifest:
     Attributes:
         split: split of the frames.
         drawn: how A of each copy was drawn.
+        camera_view: whether the copies have only the points that a camera sees.
         dataset_kind: kind of the data set of the frames.
         dataset_identity: see `identity_of`.
         copies_kind: kind of data set that each view is.
@@ -50,6 +51,7 @@ class Manifest:
 
     split: str
     drawn: AugmentedViews
+    camera_view: bool
     dataset_kind: str
     dataset_identity: str
     copies_kind: str
@@ -82,6 +84,7 @@ class Manifest:
             found = cls(
                 str(content["split"]),
                 AugmentedViews(**{**drawn, "scale_range": tuple(drawn["scale_range"])}),
+                bool(content["copies"]["camera_view"]),
                 str(content["dataset"]["kind"]),
                 str(content["dataset"]["identity"]),
                 str(content["copies"]["kind"]),
@@ -106,7 +109,11 @@ class Manifest:
         """
         path = folder / NAME
         if path.exists():
-            difference = self.read(folder).difference(self)
+            found = self.read(folder)
+            difference = found.difference(self)
+            if found.camera_view != self.camera_view:
+                with_option, without = ("with", "without")[:: 1 if found.camera_view else -1]
+                difference = f"copies {with_option} --camera-view, requested {without} it"
             if difference:
                 raise DataError(
                     f"{path}: {difference}; choose an empty folder, or delete this one first"
@@ -156,6 +163,7 @@ class Manifest:
             "copies": {
                 "kind": self.copies_kind,
                 "folders": [view_folder(view).name for view in range(self.drawn.views)],
+                "camera_view": self.camera_view,
                 "rotation_y": self.rotation_y,
                 "transform": _TRANSFORM,
             },
@@ -176,13 +184,16 @@ def view_folder(view: int, folder: Path = Path()) -> Path:
 def results_of(view: int, folder: Path) -> Path:
     """Return the results of a view: the only file or folder result* in its folder.
 
+    The inferencer of mmdetection3d writes a folder preds into that folder.
+
     Raises:
         DataError: if there is none, or there are several.
     """
     home = view_folder(view, folder)
     found = sorted(path for path in home.glob("result*") if path.suffix != ".partial")
     if len(found) == 1:
-        return found[0]
+        inner = found[0] / "preds"
+        return inner if inner.is_dir() else found[0]
     if found:
         listed = " and ".join(path.name for path in found[:2])
         raise DataError(f"{home}: contains {listed}; remove all results but one")

@@ -25,6 +25,8 @@ _LEAST_MATCHES = 20
 # Another transform must match so many times as many boxes.
 _MARGIN = 1.5
 _MINIMUM_IOU = 0.1
+# Even a weak detector finds more of its boxes again.
+_FEW = 0.2
 # Headings of one object agree to a few degrees, apart from half turns. Copies are turned by up to
 # a quarter of pi and more, and results read in a wrong meaning of rotation_y by the same angle.
 _WRONG_HEADING_RAD, _GOOD_HEADING_RAD = np.deg2rad(8), np.deg2rad(5)
@@ -97,6 +99,18 @@ def examine_copied_headings(
     return (
         f"headings differ from those of the original frames by {degrees:.0f} degrees; were the "
         "boxes turned back in part?"
+    )
+
+
+def describe_few_matches(view: int, frames: Sequence[CopiedFrame]) -> str:
+    """Return a warning if hardly a box of a view matches; "" otherwise."""
+    own = _matches(frames, [frame.similarities[view] for frame in frames])
+    possible = sum(min(len(frame.plain), len(frame.copy)) for frame in frames)
+    if possible < _LEAST_MATCHES or own >= _FEW * possible:
+        return ""
+    return (
+        f"only {own} of {possible} boxes match those of the original frames; are the files named "
+        "by the frames, not by their position?"
     )
 
 

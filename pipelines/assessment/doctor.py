@@ -21,7 +21,7 @@ from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import open_detector, open_segmenter, wants_views
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
-from pipelines.engine.rounds import newest_checkpoint
+from pipelines.engine.rounds import choose_round, newest_checkpoint
 from pipelines.labels.of_one_frame import find_frame
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
@@ -108,7 +108,8 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
-    detector = open_detector(config, newest_checkpoint(workspace))
+    number, _ = choose_round(workspace, None, None)
+    detector = open_detector(config, newest_checkpoint(workspace), number)
     missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)
     found = renamed(detector.predict(seen), config.detector.rename)
@@ -121,7 +122,9 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     ]
     findings += _headings(workspace, detector)
     checked(found, config, detector)
-    if isinstance(detector, RecordedViews):
+    if isinstance(detector, RecordedDetector) and detector.lacks_copy(frame.frame_id):
+        findings.append(Finding("views", "ok", "the augmented copies are those of another split"))
+    elif isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
         findings.append(
             Finding("views", "ok", f"{len(views)} recorded augmented copies of this frame")

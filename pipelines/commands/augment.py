@@ -37,6 +37,13 @@ def augment(
             help="Write only the K-th of N parts, such as 3/16, for several machines.",
         ),
     ] = "1/1",
+    camera_view: Annotated[
+        bool,
+        typer.Option(
+            "--camera-view",
+            help="Write only the points that a camera sees, for detectors that do not crop.",
+        ),
+    ] = False,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
     workspace: WorkspaceOption = None,
@@ -61,7 +68,8 @@ def augment(
         raise ConfigError(f"--split {split}: use one of {', '.join(SPLITS)}")
     check_executor(opened.config)
     number, _ = choose_round(opened, round_number, None)
-    planned = plan(opened, folder, split, number, Shard.parse(shard))
+    part = Shard.parse(shard)
+    planned = plan(opened, folder, split, number, part, camera_view=camera_view)
     views = planned.manifest.drawn.views
     size = f"about {planned.written_bytes / 1e6:.0f} MB"
     if dry_run:

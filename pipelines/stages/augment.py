@@ -7,7 +7,7 @@ found in the copies, see `pipelines.stages.copies`.
 import errno
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,8 +15,6 @@ from curate.datasets.base import Dataset
 from curate.datasets.copies import CopyWriter, copy_writer
 from curate.datasets.manifest import Manifest, view_folder
 from curate.errors import ConfigError, CurateError, DataError, error_prefix
-from curate.geometry.augmented_views import AugmentedViews
-from curate.geometry.similarity import Similarity
 from pipelines.assembly import fill_round
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.progress import Progress
@@ -106,18 +104,15 @@ class Result:
 class WriteCopies:
     """Writes all copies of a frame, in the process of an executor."""
 
-    def __init__(
-        self, config: Config, folder: Path, drawn: AugmentedViews, frames: Sequence[str]
-    ) -> None:
+    def __init__(self, config: Config, folder: Path, manifest: Manifest) -> None:
         self._config = config
         self._folder = folder
-        self._drawn = drawn
-        self._frames = frames
+        self._manifest = manifest
 
     def open(self) -> None:
         """Open the data set."""
         dataset = open_dataset(self._config)
-        self._writers = writers(dataset, self._folder, self._drawn, self._frames)
+        self._writers = writers(dataset, self._folder, self._manifest)
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Write the missing copies of a frame."""
@@ -128,38 +123,27 @@ class WriteCopies:
         return {}
 
 
-class _Drawn(Mapping[str, Similarity]):
-    """A of one view of each frame, drawn on access."""
-
-    def __init__(self, drawn: AugmentedViews, view: int, frames: Sequence[str]) -> None:
-        self._drawn = drawn
-        self._view = view
-        self._frames = dict.fromkeys(frames)
-
-    def __getitem__(self, frame_id: str) -> Similarity:
-        if frame_id not in self._frames:
-            raise KeyError(frame_id)
-        return self._drawn.draw(frame_id)[self._view]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._frames)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-
-def writers(
-    dataset: Dataset, folder: Path, drawn: AugmentedViews, frames: Sequence[str]
-) -> list[CopyWriter]:
+def writers(dataset: Dataset, folder: Path, manifest: Manifest) -> list[CopyWriter]:
     """Return the writer of each view."""
     return [
-        copy_writer(dataset, view_folder(view, folder), _Drawn(drawn, view, frames))
-        for view in range(drawn.views)
+        copy_writer(
+            dataset,
+            view_folder(view, folder),
+            {name: views[view] for name, views in manifest.frames.items()},
+            camera_view=manifest.camera_view,
+        )
+        for view in range(manifest.drawn.views)
     ]
 
 
 def plan(
-    workspace: Workspace, folder: Path, split: str, round_number: int, shard: Shard
+    workspace: Workspace,
+    folder: Path,
+    split: str,
+    round_number: int,
+    shard: Shard,
+    *,
+    camera_view: bool = False,
 ) -> PlannedCopies:
     """Return what is to be written; nothing is written.
 
@@ -170,10 +154,10 @@ def plan(
     if not workspace.frames(split):
         raise ConfigError(f"--split {split}: the workspace has no {split} frames")
     folder = fill_round(folder, round_number)
-    manifest = manifest_of(workspace, round_number, split)
+    manifest = manifest_of(workspace, round_number, split, camera_view=camera_view)
     manifest.check_place(folder)
     frames = shard.of(list(manifest.frames))
-    views = writers(workspace.dataset, folder, manifest.drawn, list(manifest.frames))
+    views = writers(workspace.dataset, folder, manifest)
     missing, size = [], 0
     for frame in frames:
         count = sum(not writer.is_written(frame) for writer in views)
@@ -198,8 +182,7 @@ def write(workspace: Workspace, planned: PlannedCopies, progress: Progress) -> R
     """
     folder, manifest = planned.folder, planned.manifest
     manifest.write(folder)
-    names = list(manifest.frames)
-    views = writers(workspace.dataset, folder, manifest.drawn, names)
+    views = writers(workspace.dataset, folder, manifest)
     for writer in views:
         writer.prepare()
     result = Result(
@@ -211,7 +194,7 @@ def write(workspace: Workspace, planned: PlannedCopies, progress: Progress) -> R
         len(planned.frames),
         len(planned.frames) - len(planned.missing),
     )
-    function = WriteCopies(workspace.config, folder, manifest.drawn, names)
+    function = WriteCopies(workspace.config, folder, manifest)
     jobs = [FrameJob(number, name) for number, name in enumerate(planned.missing)]
     total = len(planned.missing)
     with open_executor(workspace) as work, progress.track("augment", total) as advance:

@@ -13,6 +13,7 @@ from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError, DataError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
+    describe_few_matches,
     examine_copied_headings,
     examine_copies,
 )
@@ -45,7 +46,9 @@ def augmented_views(config: Config, seed: int, round_number: int) -> AugmentedVi
     )
 
 
-def manifest_of(workspace: Workspace, round_number: int, split: str) -> Manifest:
+def manifest_of(
+    workspace: Workspace, round_number: int, split: str, *, camera_view: bool = False
+) -> Manifest:
     """Return the manifest that copies of a split for a round must have.
 
     Raises:
@@ -57,6 +60,7 @@ def manifest_of(workspace: Workspace, round_number: int, split: str) -> Manifest
     return Manifest(
         split,
         drawn,
+        camera_view,
         config.dataset.kind,
         identity_of(dataset, frames),
         copy_kind(dataset),
@@ -139,4 +143,6 @@ def _problem(
         return found
 
     compared = read()
+    if few := describe_few_matches(view, compared):
+        _log.warning("%s: %s", detector.views_of_copies[view].path, few)
     return examine_copies(view, compared) or examine_copied_headings(view, compared, read)

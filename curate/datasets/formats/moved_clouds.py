@@ -17,18 +17,22 @@ from curate.datasets.formats.cloud_formats import (
     split_header,
 )
 from curate.datasets.formats.point_layout import PointLayout
-from curate.errors import DataError
+from curate.errors import ConfigError, DataError
 from curate.files.atomic import atomic_path, replace_file
 from curate.files.npy import map_npy
-from curate.shapes import Float
+from curate.shapes import Bool, Float
 
 Move = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 """Returns the new coordinates of points, in the same dtype."""
+Keep = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
+"""Returns which points are kept, from their original coordinates."""
 
 _COMPRESSED = b"binary_compressed"
 
 
-def move_cloud(source: Path, target: Path, layout: PointLayout, move: Move) -> None:
+def move_cloud(
+    source: Path, target: Path, layout: PointLayout, move: Move, keep: Keep | None = None
+) -> None:
     """Write the points of a file with other coordinates, atomically.
 
     Args:
@@ -36,8 +40,10 @@ def move_cloud(source: Path, target: Path, layout: PointLayout, move: Move) -> N
         target: the file to write; its suffix is that of the source.
         layout: the layout of the source.
         move: returns the new x, y, z of the points.
+        keep: returns which points are written; None for all.
 
     Raises:
+        ConfigError: if only some points of a file with a header are to be written.
         DataError: if the file is missing or damaged, or coordinates are integers in a file with
             named fields, which cannot hold other ones.
     """
@@ -46,11 +52,15 @@ def move_cloud(source: Path, target: Path, layout: PointLayout, move: Move) -> N
         names = layout.names
         values = np.frombuffer(bytearray(read_bytes(source, "point")), "<f4")
         table = values.reshape(-1, len(names))
-        columns = layout.indices(source, names)[:3]
-        table[:, columns] = _moved(table[:, columns], move)
-        replace_file(target, values.tobytes())
-    elif suffix == ".npy":
-        _move_npy(source, target, layout, move)
+        table = _moved_rows(table, layout.indices(source, names)[:3], move, keep)
+        replace_file(target, table.tobytes())
+    elif suffix == ".npy" and (keep is None or map_npy(source, "point").dtype.names is None):
+        _move_npy(source, target, layout, move, keep)
+    elif keep is not None:
+        raise ConfigError(
+            f"{source}: only .bin files and .npy files of rows can be written in part; leave out "
+            "--camera-view, the calibration of the copies fits a crop by the detector"
+        )
     elif suffix == ".pcd":
         replace_file(target, _moved_pcd(source, layout, move))
     else:
@@ -62,14 +72,27 @@ def _moved(points: np.ndarray, move: Move) -> np.ndarray:
         return move(points)
 
 
-def _move_npy(source: Path, target: Path, layout: PointLayout, move: Move) -> None:
+def _moved_rows(
+    table: np.ndarray, columns: Sequence[int], move: Move, keep: Keep | None
+) -> np.ndarray:
+    """Return (m, c) the kept ones of (n, c) rows, with other coordinates."""
+    points = table[:, columns]
+    if keep is not None:
+        kept = keep(points)
+        table, points = table[kept], points[kept]
+    table[:, columns] = _moved(points, move)
+    return table
+
+
+def _move_npy(
+    source: Path, target: Path, layout: PointLayout, move: Move, keep: Keep | None
+) -> None:
     table = np.array(map_npy(source, "point"))
     names = table.dtype.names
     if names is None:
         if table.dtype.kind != "f":
             table = table.astype(np.float64)
-        columns = layout.indices(source, layout.names)[:3]
-        table[:, columns] = _moved(table[:, columns], move)
+        table = _moved_rows(table, layout.indices(source, layout.names)[:3], move, keep)
     else:
         axes = [names[k] for k in layout.indices(source, names)[:3]]
         _check_floats(source, [table.dtype[name] for name in axes])

@@ -32,6 +32,7 @@ from curate.files.links import link_file
 from curate.frames import Calibration
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.poses import invert_pose
+from curate.geometry.projection import in_camera_view
 from curate.geometry.similarity import Similarity
 
 # Tables that copies share with the data set, and those that would contain ground truth.
@@ -60,6 +61,7 @@ class NuScenesCopies:
         tables: its folder of tables.
         folder: root of the copies.
         copies: A of each frame, None for a frame that is copied as it is.
+        camera_view: whether only the points that a camera of the data set sees are written.
     """
 
     kind = "nuscenes"
@@ -70,11 +72,14 @@ class NuScenesCopies:
         tables: Path,
         folder: Path,
         copies: Mapping[str, Similarity | None],
+        *,
+        camera_view: bool,
     ) -> None:
         self._dataset = dataset
         self._tables = tables
         self._folder = folder
         self._copies = copies
+        self._camera_view = camera_view
         self.frame_ids = tuple(sorted(copies))
 
     def prepare(self) -> None:
@@ -84,6 +89,12 @@ class NuScenesCopies:
         for name in _SHARED:
             if (self._tables / f"{name}.json").exists():
                 link_file(self._tables / f"{name}.json", home / f"{name}.json")
+        maps = self._tables / "map.json"
+        for record in read_table(maps).values() if maps.exists() else ():
+            name = text(maps, record, "filename")
+            self._dataset.check_path(name)
+            if (self._dataset.root / name).is_file():  # nuScenes' development kit opens them
+                link_file(self._dataset.root / name, self._folder / name)
         scenes, samples = self._chains()
         data, mounted, used = self._sensor_data()
         poses = [record for record in self._vehicles.values() if record["token"] in used]
@@ -102,7 +113,7 @@ class NuScenesCopies:
 
     def write(self, frame_id: str) -> None:
         """Link the images and write the sweep of a copy."""
-        self._dataset.read(frame_id)  # checks its files
+        frame = self._dataset.read(frame_id)  # checks its files
         for record in self._records[frame_id].values():
             source = self._dataset.root / record["filename"]
             if record["filename"] != self._sweep(frame_id) and source.exists():
@@ -110,10 +121,21 @@ class NuScenesCopies:
         source = self._dataset.files(frame_id).points
         target = self._folder / self._sweep(frame_id)
         similarity = self._copies[frame_id]
-        if similarity is None:
+        if similarity is None and not self._camera_view:
             link_file(source, target)
-        else:
-            move_cloud(source, target, self._dataset.layout, _in_sensor_axes(similarity))
+            return
+        move = (similarity or Similarity()).apply_to_points
+        # nuScenes' axes are x right, y forward.
+        turn = TO_SENSOR_AXES[:3, :3].astype(np.float32)
+        move_cloud(
+            source,
+            target,
+            self._dataset.layout,
+            lambda points: move(points @ turn) @ turn.T,
+            (lambda points: in_camera_view(frame.with_points(points @ turn)))
+            if self._camera_view
+            else None,
+        )
 
     def _sweep(self, frame_id: str) -> str:
         """Return the path of a frame's sweep within the data set."""
@@ -242,9 +264,3 @@ class NuScenesCopies:
             "rotation": [w, x, y, z],
             "camera_intrinsic": copied.projection[:, :3].tolist(),
         }
-
-
-def _in_sensor_axes(similarity: Similarity) -> Any:
-    """Return A for points in nuScenes' axes, x right and y forward."""
-    turn = TO_SENSOR_AXES[:3, :3].astype(np.float32)
-    return lambda points: similarity.apply_to_points(points @ turn) @ turn.T

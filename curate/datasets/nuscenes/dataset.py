@@ -218,9 +218,11 @@ class NuScenesDataset:
             )
         return self._annotations.read(frame_id, self._frame(frame_id).cameras)
 
-    def copy_writer(self, folder: Path, copies: Mapping[str, Similarity | None]) -> NuScenesCopies:
+    def copy_writer(
+        self, folder: Path, copies: Mapping[str, Similarity | None], *, camera_view: bool
+    ) -> NuScenesCopies:
         """Return the writer of copies of some frames."""
-        return NuScenesCopies(self, self._tables, folder, copies)
+        return NuScenesCopies(self, self._tables, folder, copies, camera_view=camera_view)
 
     def check_path(self, name: str) -> None:
         """Raise DataError if the path of a file in the tables leads out of the data set."""

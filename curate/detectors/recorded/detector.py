@@ -210,6 +210,10 @@ class RecordedDetector:
         """The results of each view of a folder of augmented copies; empty without one."""
         return self._copies.views if self._copies else ()
 
+    def lacks_copy(self, frame_id: str) -> bool:
+        """Return whether there are augmented copies, but none of this frame."""
+        return self._copies is not None and frame_id not in self._copies.manifest.frames
+
     def category_names(self) -> frozenset[str]:
         """Return the category names of all recorded boxes, after `rename`.
 
