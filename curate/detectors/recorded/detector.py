@@ -166,10 +166,10 @@ class RecordedDetector:
         self._recorded_as = {frame: name for name, frame in found.items() if name != frame}
         self._copies: _Copies | None = None
         if augmented is not None:
-            if self._record.has_views:
+            if passes:
                 raise ConfigError(
-                    f"{self.path}: has augmented copies of its own, and detector.augmented is set; "
-                    "remove one of them"
+                    "detector.options.passes and detector.augmented are both set; remove one of "
+                    "them"
                 )
             folder = Path(augmented)
             manifest = Manifest.read(folder)
