@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from curate.datasets.copies import copy_kind
-from curate.datasets.manifest import NAME, Manifest, identity_of, view_folder
+from curate.datasets.manifest import NAME, Manifest, sample_hashes, view_folder
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError, DataError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
     describe_few_matches,
-    examine_copied_headings,
+    describe_headings,
     examine_copies,
+    examine_rotation_y,
 )
 from curate.frames import Calibration, RotationY
 from curate.geometry.augmented_views import AugmentedViews
@@ -62,7 +63,7 @@ def manifest_of(
         drawn,
         camera_view,
         config.dataset.kind,
-        identity_of(dataset, frames),
+        sample_hashes(dataset, frames),
         copy_kind(dataset),
         _rotation_y(config, dataset.read(frames[0], points=False).calibration),
         {name: drawn.draw(name) for name in frames},
@@ -145,4 +146,6 @@ def _problem(
     compared = read()
     if few := describe_few_matches(view, compared):
         _log.warning("%s: %s", detector.views_of_copies[view].path, few)
-    return examine_copies(view, compared) or examine_copied_headings(view, compared, read)
+    elif headings := describe_headings(view, compared):
+        _log.warning("%s: %s", detector.views_of_copies[view].path, headings)
+    return examine_copies(view, compared) or examine_rotation_y(view, compared, read)
