@@ -144,8 +144,8 @@ def _problem(
         return found
 
     compared = read()
-    if few := describe_few_matches(view, compared):
-        _log.warning("%s: %s", detector.views_of_copies[view].path, few)
-    elif headings := describe_headings(view, compared):
-        _log.warning("%s: %s", detector.views_of_copies[view].path, headings)
-    return examine_copies(view, compared) or examine_rotation_y(view, compared, read)
+    problem = examine_copies(view, compared) or examine_rotation_y(view, compared, read)
+    remark = describe_few_matches(view, compared) or describe_headings(view, compared)
+    if remark and not problem:
+        _log.warning("%s: %s", detector.views_of_copies[view].path, remark)
+    return problem
