@@ -77,26 +77,27 @@ def examine_copies(view: int, frames: Sequence[CopiedFrame]) -> str:
     if not frames:
         return ""
     own = _matches(frames, [frame.similarities[view] for frame in frames])
+    others = {
+        other: _matches_of_others(view, frames, [each.similarities[other] for each in frames])
+        for other in range(len(frames[0].similarities))
+        if other != view
+    }
     untouched = _matches_of_others(view, frames, [Similarity()] * len(frames))
     total = sum(len(frame.plain) for frame in frames)
-    if _is_better(untouched, own):
+    best = max(untouched, *others.values()) if others else untouched
+    if best < _LEAST_MATCHES or best <= _MARGIN * own:
+        return ""
+    if best == untouched:
         return (
             f"{untouched} of {total} boxes lie where those of the original frames lie, but only "
             f"{own} do after A^-1: these are results of the original frames, or their boxes were "
             "mapped back already; run the detector on the copies, and leave its boxes as they are"
         )
-    for other in range(len(frames[0].similarities)):
-        found = _matches_of_others(view, frames, [each.similarities[other] for each in frames])
-        if other != view and _is_better(found, own):
-            return (
-                f"these are results of view-{other + 1}: {found} of {total} boxes match its "
-                f"copies, {own} those of view-{view + 1}"
-            )
-    return ""
-
-
-def _is_better(matches: int, own: int) -> bool:
-    return matches >= _LEAST_MATCHES and matches > _MARGIN * own
+    other = max(others, key=lambda each: others[each])
+    return (
+        f"these are results of view-{other + 1}: {best} of {total} boxes match its copies, {own} "
+        f"those of view-{view + 1}"
+    )
 
 
 def _matches_of_others(
