@@ -3,25 +3,31 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+# What the tests need besides; the demo does without.
+TEST_READY := $(VENV)/.ready-tests
+TEST_EXTRAS ?= test,lint,postgres,serve,browser,nuscenes
 # "no" goes on where the libraries of open3d are missing; only `simulate` and `demo` need them.
 SIMULATION ?= yes
 
-.PHONY: venv demo test shapes prove prove-gpu prove-bare fuzz fuzz-all bench lint docs site wheel clean
+.PHONY: venv venv-tests demo test shapes prove prove-gpu prove-bare fuzz fuzz-all bench lint docs site wheel \
+	clean
 
 venv: $(READY)
+
+venv-tests: $(TEST_READY)
 
 demo: $(READY)
 	$(BIN)/curate demo
 
-test: $(READY)
+test: $(TEST_READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # The same tests, with the shape of every array checked wherever a function of curate is called.
-shapes: $(READY)
+shapes: $(TEST_READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal \
 		--jaxtyping-packages=curate,support.shapes.check
 
-prove: $(READY)
+prove: $(TEST_READY)
 	$(BIN)/python -m pytest -m slow
 
 # Checks on a GPU, with frames per second; without one it says that they were not run.
@@ -33,23 +39,23 @@ SUITES ?= bookworm trixie
 prove-bare:
 	$(PYTHON) .ci/prove_bare.py $(SUITES)
 
-wheel: $(READY)
+wheel: $(TEST_READY)
 	$(BIN)/pip wheel -q --no-deps --no-build-isolation --wheel-dir dist .
 
 # `make test` tries the same damaged files every time; this tries new ones, for an hour in all, and
 # prints a log. The files of its findings are in .fuzzing/.
 FUZZ_SECONDS ?= 3600
-fuzz-all: $(READY)
+fuzz-all: $(TEST_READY)
 	cd tests && PYTHONPATH=.:.. ../$(BIN)/python -m fuzzing.all_readers $(FUZZ_SECONDS) ../.fuzzing
 
 # Coverage-guided, where atheris is installed: make fuzz READER="label file" SECONDS=600
 READER ?= labels
 SECONDS ?= 60
-fuzz: $(READY)
+fuzz: $(TEST_READY)
 	cd tests && PYTHONPATH=.:.. ../$(BIN)/python -m fuzzing.guided "$(READER)" $(SECONDS)
 
 # One thread per library; ratios and frames per second, written to docs/benchmarks.{json,md}.
-bench: $(READY)
+bench: $(TEST_READY)
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
 	@mkdir -p .benchmarks
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/benchmarks/bench_*.py -q \
@@ -57,12 +63,12 @@ bench: $(READY)
 		--benchmark-columns=min,median,rounds --benchmark-json=.benchmarks/measured.json
 	$(BIN)/python tests/benchmarks/report.py .benchmarks/measured.json docs
 
-lint: $(READY)
+lint: $(TEST_READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy curate db pipelines curate_command.py
 
-docs: $(READY)
+docs: $(TEST_READY)
 	$(BIN)/python -m docs.generate
 
 # The pages as a website in site/, which loads nothing from elsewhere.
@@ -77,12 +83,20 @@ clean:
 # accepts either build of the same version.
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) .ci/check_system.py $(if $(filter no,$(SIMULATION)),--without-simulation)
-	$(PYTHON) -m venv $(VENV)
+	@echo "Creating $(VENV)/: about 2.2 GB, one to five minutes, mostly for downloads."
+	@$(PYTHON) -m venv $(VENV)
 	@command -v nvidia-smi >/dev/null 2>&1 \
-		|| $(BIN)/pip install -q -c constraints.txt torch==2.13.0+cpu 2>/dev/null \
-		|| echo "The index offers no CPU build of torch; installing the general one."
-	$(BIN)/pip install -q -c constraints.txt -e '.[test,lint,postgres,serve,browser,nuscenes]'
+		|| { echo "1 of 2: PyTorch, the build without CUDA"; \
+		$(BIN)/python .ci/install.py 900 torch==2.13.0+cpu --otherwise \
+			"The index does not offer it; the general build follows, which may be larger."; }
+	@echo "2 of 2: curate and the packages that it needs"
+	@$(BIN)/python .ci/install.py 1350 .
 ifneq ($(SIMULATION),no)
 	@$(BIN)/python -c 'from curate.simulation.open3d_loader import load; load()'
 endif
+	@touch $@
+
+$(TEST_READY): $(READY)
+	@echo "Adding the packages of the tests to $(VENV)/: about 0.8 GB"
+	@$(BIN)/python .ci/install.py 800 '.[$(TEST_EXTRAS)]'
 	@touch $@

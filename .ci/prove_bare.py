@@ -1,4 +1,4 @@
-"""Prove that `make venv`, the demo and the tests work in minimal Debian systems, made here.
+"""Prove that `make venv-tests`, the demo and the tests work in minimal Debian systems, made here.
 
 Usage, as root, with debootstrap installed: prove_bare.py SUITE...
 
@@ -34,10 +34,10 @@ PYTEST = ".venv/bin/python -m pytest -q"
 STEPS = (
     # Without root, one command lists everything that is missing, and nothing is downloaded.
     ("! su nobody -s /bin/sh -c 'python3 .ci/check_system.py'", "what is missing"),
-    ("make venv SIMULATION=no", "venv without simulation"),
+    ("make venv-tests SIMULATION=no", "venv without simulation"),
     ("! .venv/bin/curate simulate /tmp/data --frames 8", "simulation reports what it needs"),
     (f"{PYTEST} tests/pipelines/test_without_open3d.py", "own data without simulation"),
-    ("rm .venv/.ready && make venv", "venv"),
+    ("rm .venv/.ready* && make venv-tests", "venv"),
     (
         ".venv/bin/curate demo /tmp/demo --frames 16 --val 4 --labeled 0.25 --steps 20",
         "demo",

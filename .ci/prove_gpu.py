@@ -17,7 +17,7 @@ def main() -> int:
     device = os.environ.get("CURATE_GPU_DEVICE", "")
     if not (torch.accelerator.is_available() or found or device):
         runtime = ", ".join(name.removesuffix("ExecutionProvider") for name in providers())
-        print(  # noqa: T201 - the result
+        print(
             f"make prove-gpu was NOT RUN: torch {torch.__version__} finds no accelerator, and ONNX "
             f"Runtime {importlib.metadata.version('onnxruntime')} has only {runtime}. Nothing was "
             "checked on a GPU."

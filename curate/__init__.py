@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from curate.evaluation.kitti_folders import SensorFolders, evaluate_folders, read_folders
     from curate.exporters.data_frames import read_labels
     from curate.frames import Calibration, Camera, Frame
+    from curate.geometry.augmented_views import AugmentedViews, augmented_frame
     from curate.geometry.boxes import bev_corners, box_corners
     from curate.geometry.nms import nms_bev
     from curate.geometry.overlap import bev_iou, iou_3d
@@ -73,6 +74,7 @@ __all__ = [
     "ST3D",
     "Age",
     "Annotations",
+    "AugmentedViews",
     "Baseline",
     "Calibration",
     "Camera",
@@ -113,6 +115,7 @@ __all__ = [
     "Uniform",
     "WeightedLabels",
     "Weights",
+    "augmented_frame",
     "bev_corners",
     "bev_iou",
     "box_corners",
@@ -171,6 +174,7 @@ PUBLIC_MODULES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "curate.geometry.boxes": ("bev_corners", "box_corners"),
         "curate.geometry.projection": ("in_view", "image_rectangles"),
         "curate.geometry.similarity": ("Similarity",),
+        "curate.geometry.augmented_views": ("AugmentedViews", "augmented_frame"),
     },
     "Evidence and weights": {
         "curate.priors.points": ("PointPrior",),

@@ -6,6 +6,7 @@ No other module creates detectors, segmenters, priors or policies.
 import dataclasses
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +14,13 @@ from curate.category_names import inline_table, listed, mapping
 from curate.consistency import ConsistencySettings
 from curate.datasets.base import Dataset
 from curate.datasets.frame_names import FrameNames
-from curate.detectors.base import BatchDetector, Detector, TrainableDetector, choose_preset
+from curate.detectors.base import (
+    BatchDetector,
+    CopiesDetector,
+    Detector,
+    TrainableDetector,
+    choose_preset,
+)
 from curate.errors import ConfigError, CurateError, DataError, error_prefix
 from curate.exporters.base import DataToExport, Selective
 from curate.files.onnx_providers import CPU
@@ -27,7 +34,7 @@ from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
 from curate.weighting.base import Policy
 from pipelines import registry
 from pipelines.devices import (
-    Place,
+    ModelPlace,
     check_detector_place,
     check_segmenter_place,
     detector_place,
@@ -40,19 +47,37 @@ Kind = TypeVar("Kind")
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
-def open_detector(config: Config, path: Path, copies_of: int | None = None) -> Detector:
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a detector predicts, for detectors that read copies or leave files.
+
+    Attributes:
+        folder: folder of the workspace.
+        round_number: number e of the round.
+        copies: whether it predicts the augmented copies; results in `detector.augmented` are read
+            only then.
+    """
+
+    folder: Path
+    round_number: int
+    copies: bool = False
+
+
+def open_detector(config: Config, path: Path | None, place: Place | None = None) -> Detector:
     """Return the configured detector, loaded from a checkpoint, a model or result files.
 
     Args:
         config: the configuration.
         path: the checkpoint, model or result files.
-        copies_of: number of a round whose augmented copies it predicts as well. Without it, results
-            in `detector.augmented` are not read.
+        place: workspace and round.
     """
     section = config.detector
     offered = dict(_offered_to_detectors(config))
-    if copies_of is not None:
-        offered["augmented"] = lambda: copies_folder(config, copies_of)
+    if place is not None:
+        number = place.round_number
+        offered |= {"folder": lambda: place.folder, "round_number": lambda: number}
+        if place.copies:
+            offered["augmented"] = lambda: copies_folder(config, number)
     detector: Detector = registry.DETECTORS.build(
         section.name, path, offered=offered, options=section.options
     )
@@ -92,23 +117,36 @@ def check_detector(config: Config) -> None:
             options=config.detector.options,
         )
     check_detector_place(config)
+    if runs_elsewhere(config):
+        open_detector(config, config.detector.path)
     trainable_detector(config)
+
+
+def runs_elsewhere(config: Config) -> bool:
+    """Return whether the detector gets copies of files; it needs no path and loads no model."""
+    return _is_detector(config, CopiesDetector)
 
 
 def batch_size(config: Config) -> int:
     """Return how many frames the configured detector gets at a time."""
-    detector = registry.DETECTORS.load(config.detector.name)
-    if not (isinstance(detector, type) and issubclass(detector, BatchDetector)):
+    if not (_is_detector(config, BatchDetector) or runs_elsewhere(config)):
         return 1
     if config.detector.batch_size != "auto":
         return config.detector.batch_size
-    place = detector_place(config) or Place()
-    return detector.batch_size(place.hardware)
+    detector = registry.DETECTORS.load(config.detector.name)
+    place = detector_place(config)
+    preferred: int = detector.batch_size(place.hardware if place else CPU.name)
+    return preferred
+
+
+def _is_detector(config: Config, protocol: type) -> bool:
+    detector = registry.DETECTORS.load(config.detector.name)
+    return isinstance(detector, type) and issubclass(detector, protocol)
 
 
 def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
-    def place() -> Place:
-        return detector_place(config) or Place()
+    def place() -> ModelPlace:
+        return detector_place(config) or ModelPlace()
 
     return {
         "minimum_score": lambda: config.detector.minimum_score,
@@ -121,6 +159,9 @@ def _offered_to_detectors(config: Config) -> Mapping[str, Callable[[], Any]]:
         "precision": lambda: config.detector.precision,
         "providers": lambda: place().providers,
         "provider_options": lambda: place().options,
+        "open_dataset": lambda: partial(open_dataset, config),
+        "timeout_s": lambda: config.detector.timeout_s,
+        "camera_view": lambda: config.detector.camera_view,
     }
 
 

@@ -207,7 +207,7 @@ def _print_detectors(workspace: Workspace) -> None:
         typer.echo(f"   Not in the means, because no object counts: {', '.join(sorted(left_out))}.")
 
 
-def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path]]:
+def _detectors(workspace: Workspace) -> Sequence[tuple[str, Path | None]]:
     """Return the detectors to compare, with their checkpoints."""
     rounds = workspace.config.run.rounds
     first = open_round(workspace, 1)

@@ -27,7 +27,7 @@ from pipelines.workspace.config import Config
 
 
 @dataclass(frozen=True)
-class Place:
+class ModelPlace:
     """Where a model runs.
 
     Attributes:
@@ -59,7 +59,7 @@ class Place:
         return f"ONNX Runtime on {', or '.join(names)}"
 
 
-def detector_place(config: Config) -> Place | None:
+def detector_place(config: Config) -> ModelPlace | None:
     """Return where the detector predicts; None if it runs no model that curate knows of.
 
     Raises:
@@ -70,24 +70,24 @@ def detector_place(config: Config) -> Place | None:
         registry.DETECTORS.takes(section.name, argument) for argument in ("device", "providers")
     )
     if in_runtime and section.providers != AUTO:
-        return Place(providers=section.providers, options=section.provider_options)
+        return ModelPlace(providers=section.providers, options=section.provider_options)
     if in_torch:
         device = choose_device(section.device)
         in_runtime = in_runtime and device == CPU.name and section.precision == FLOAT32
-        return Place(providers=CPU.name) if in_runtime else Place(device)
+        return ModelPlace(providers=CPU.name) if in_runtime else ModelPlace(device)
     if in_runtime:
         with error_prefix("detector.device"):
-            return Place(None, *providers_of_device(section.device, section.provider_options))
+            return ModelPlace(None, *providers_of_device(section.device, section.provider_options))
     return None
 
 
-def segmenter_place(config: Config) -> Place | None:
+def segmenter_place(config: Config) -> ModelPlace | None:
     """Return where the segmenter runs; None if it runs no model that curate knows of."""
     section = config.segmenter
     name = "onnx" if section.name == "simulated" else section.name
     if name == "none" or not registry.SEGMENTERS.takes(name, "providers"):
         return None
-    return Place(providers=section.providers, options=section.provider_options)
+    return ModelPlace(providers=section.providers, options=section.provider_options)
 
 
 def check_detector_place(config: Config) -> None:
@@ -125,13 +125,13 @@ def check_segmenter_place(config: Config) -> None:
         _check_providers(segmenter_place(config), config.segmenter.providers)
 
 
-def idle_gpu(*places: Place | None) -> bool:
+def idle_gpu(*places: ModelPlace | None) -> bool:
     """Return whether this machine has a GPU of NVIDIA, and no model uses it."""
     used = any(place.exclusive for place in places if place)
     return not used and any(places) and shutil.which("nvidia-smi") is not None
 
 
-def _check_providers(place: Place | None, listed: Providers) -> None:
+def _check_providers(place: ModelPlace | None, listed: Providers) -> None:
     """Raise ConfigError if listed providers have no effect, or one is not installed."""
     if listed != AUTO and (place is None or place.device is not None):
         raise ConfigError("the configured class does not run in ONNX Runtime; remove the setting")

@@ -168,6 +168,7 @@ DETECTORS = Registry(
         "pillars": "curate.detectors.pillars:PillarDetector",
         "onnx": "curate.detectors.onnx:OnnxDetector",
         "recorded": "curate.detectors.recorded:RecordedDetector",
+        "command": "curate.detectors.command:CommandDetector",
     },
 )
 SEGMENTERS = Registry(

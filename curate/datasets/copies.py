@@ -48,10 +48,12 @@ class CopyWriter(Protocol):
 
     Attributes:
         kind: kind of data set that the copies are.
+        clouds: folder of the points within the copies.
         frame_ids: the frames, sorted.
     """
 
     kind: str
+    clouds: str
     frame_ids: tuple[str, ...]
 
     def prepare(self) -> None:
@@ -179,6 +181,7 @@ class KittiCopies(_Copies):
     """
 
     kind = "kitti"
+    clouds = "training/velodyne"
 
     @property
     def _home(self) -> Path:
@@ -223,6 +226,7 @@ class FolderCopies(_Copies):
     """
 
     kind = "folder"
+    clouds = "points"
 
     def prepare(self) -> None:
         """Write dataset.toml and the frame list."""

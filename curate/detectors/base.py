@@ -10,7 +10,7 @@ import numpy as np
 
 from curate.detections import Detections
 from curate.errors import ConfigError, CurateError
-from curate.frames import Frame
+from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.ground import GroundMap
 from curate.geometry.similarity import Similarity
 from curate.shapes import Bool, Float, Float32, Shaped
@@ -52,6 +52,34 @@ class BatchDetector(Detector, Protocol):
         The boxes of a frame do not depend on the other frames. If the call raises an error, it is
         repeated with smaller batches, so that only frames fail that raise it by themselves.
         """
+        ...
+
+
+@runtime_checkable
+class CopiesDetector(Protocol):
+    """A detector that runs elsewhere, on copies of the files of the frames."""
+
+    @classmethod
+    def batch_size(cls, device: str) -> int:
+        """Return how many frames it gets at a time by default."""
+        ...
+
+    def predict_copies(
+        self, copies: Mapping[str, Similarity | None], view: int = 0
+    ) -> Sequence[Detections | CurateError]:
+        """Return the boxes that it finds in each frame or copy A(x), in the frame of A(x).
+
+        Args:
+            copies: A of each frame, by frame id; None for the frame itself.
+            view: number of the copy, from 1; 0 for the frames themselves.
+
+        Returns:
+            For each frame, in the same order, its boxes or the error of this frame.
+        """
+        ...
+
+    def rotation_y_of_copies(self, calibration: Calibration) -> RotationY:
+        """Return how rotation_y of results of copies is read, for the calibration of a frame."""
         ...
 
 

@@ -8,6 +8,10 @@ missed. Over many frames, results of other clouds match better under another tra
 | by A^-1 of this view | nothing, the results belong to the copies |
 | as they are | the detector ran on x, or the boxes were mapped back already |
 | by A^-1 of another view | results of another view |
+
+Files in KITTI's form are in the frame of a camera that turns with the cloud. Those of x, read by
+the calibration of a copy, are therefore turned like the copy, but neither flipped nor scaled; those
+of another view are turned like this copy, but flipped and scaled like the other one.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,12 +27,13 @@ from curate.geometry.similarity import Similarity, wrap_angle
 # So many boxes of the frames must match in some way before anything is concluded.
 _LEAST_MATCHES = 20
 # Another transform must match so many times as many boxes.
-_MARGIN = 1.5
-_MINIMUM_IOU = 0.1
+_MARGIN = 1.3
+_MINIMUM_IOU = 0.3
 # Even a weak detector finds more of its boxes again.
 _FEW = 0.2
 # Headings of one object agree to a few degrees, apart from half turns. Copies are turned by up to
 # a quarter of pi and more, and results read in a wrong meaning of rotation_y by the same angle.
+_MEANINGS: tuple[RotationY, ...] = ("openpcdet", "calibration", "nuscenes")
 _WRONG_HEADING_RAD, _GOOD_HEADING_RAD = np.deg2rad(8), np.deg2rad(5)
 
 
@@ -47,6 +52,21 @@ class CopiedFrame:
     similarities: Sequence[Similarity]
 
 
+def examine_view(
+    view: int, read_as: Callable[[RotationY | None], Sequence[CopiedFrame]]
+) -> tuple[str, str]:
+    """Return what is wrong with the results of a view, and what may be; "" for nothing.
+
+    Args:
+        view: number of the view, from 0.
+        read_as: returns some frames with results read in a meaning of rotation_y; None for the
+            configured one.
+    """
+    frames = read_as(None)
+    problem = examine_copies(view, frames) or examine_rotation_y(view, frames, read_as)
+    return problem, describe_few_matches(view, frames) or describe_headings(view, frames)
+
+
 def examine_copies(view: int, frames: Sequence[CopiedFrame]) -> str:
     """Return what is wrong with the results of a view; "" if nothing is.
 
@@ -54,12 +74,17 @@ def examine_copies(view: int, frames: Sequence[CopiedFrame]) -> str:
         view: number of the view, from 0.
         frames: some frames.
     """
-    views = len(frames[0].similarities) if frames else 0
-    by_view = [_matches(frames, [frame.similarities[k] for frame in frames]) for k in range(views)]
-    own = by_view[view] if frames else 0
-    untouched = _matches(frames, [Similarity()] * len(frames))
+    if not frames:
+        return ""
+    own = _matches(frames, [frame.similarities[view] for frame in frames])
+    others = {
+        other: _matches_of_others(view, frames, [each.similarities[other] for each in frames])
+        for other in range(len(frames[0].similarities))
+        if other != view
+    }
+    untouched = _matches_of_others(view, frames, [Similarity()] * len(frames))
     total = sum(len(frame.plain) for frame in frames)
-    best = max(untouched, *by_view, 0)
+    best = max(untouched, *others.values()) if others else untouched
     if best < _LEAST_MATCHES or best <= _MARGIN * own:
         return ""
     if best == untouched:
@@ -68,16 +93,30 @@ def examine_copies(view: int, frames: Sequence[CopiedFrame]) -> str:
             f"{own} do after A^-1: these are results of the original frames, or their boxes were "
             "mapped back already; run the detector on the copies, and leave its boxes as they are"
         )
-    other = by_view.index(best) + 1
-    return f"these are results of view-{other} ({best} of {total} boxes match, {own} here)"
+    other = max(others, key=lambda each: others[each])
+    return (
+        f"these are results of view-{other + 1}: {best} of {total} boxes match its copies, {own} "
+        f"those of view-{view + 1}"
+    )
 
 
-def examine_copied_headings(
+def _matches_of_others(
+    view: int, frames: Sequence[CopiedFrame], similarities: Sequence[Similarity]
+) -> int:
+    """Return how many boxes match if the results are those of other clouds; see the module."""
+    turned = [
+        Similarity(each.flip_y, frame.similarities[view].rotation_rad, each.scale)
+        for frame, each in zip(frames, similarities, strict=True)
+    ]
+    return max(_matches(frames, similarities), _matches(frames, turned))
+
+
+def examine_rotation_y(
     view: int,
     frames: Sequence[CopiedFrame],
     read_as: Callable[[RotationY], Sequence[CopiedFrame]],
 ) -> str:
-    """Return what is wrong with the headings of a view; "" if nothing is.
+    """Return which meaning of rotation_y fits a view if the one it was read in does not.
 
     Args:
         view: number of the view, from 0.
@@ -87,18 +126,25 @@ def examine_copied_headings(
     errors = _heading_errors(view, frames)
     if len(errors) < _LEAST_MATCHES or np.median(errors) < _WRONG_HEADING_RAD:
         return ""
-    degrees = np.rad2deg(np.median(errors))
-    meanings: tuple[RotationY, ...] = ("openpcdet", "calibration", "nuscenes")
-    for meaning in meanings:
-        if np.median(_heading_errors(view, read_as(meaning))) < _GOOD_HEADING_RAD:
+    for meaning in _MEANINGS:
+        others = _heading_errors(view, read_as(meaning))
+        if len(others) and np.median(others) < _GOOD_HEADING_RAD:
             return (
-                f"headings differ from those of the original frames by {degrees:.0f} degrees, but "
-                f'not if rotation_y is read as "{meaning}"; set detector.options.rotation_y = '
-                f'"{meaning}"'
+                f"headings differ by {np.rad2deg(np.median(errors)):.0f} degrees (median) from "
+                f'those of the original frames, but not if rotation_y is read as "{meaning}"; set '
+                f'detector.options.rotation_y = "{meaning}"'
             )
+    return ""
+
+
+def describe_headings(view: int, frames: Sequence[CopiedFrame]) -> str:
+    """Return a warning if the headings of a view do not turn with the copies; "" otherwise."""
+    errors = _heading_errors(view, frames)
+    if len(errors) < _LEAST_MATCHES or np.median(errors) < _WRONG_HEADING_RAD:
+        return ""
     return (
-        f"headings differ from those of the original frames by {degrees:.0f} degrees; were the "
-        "boxes turned back in part?"
+        f"headings differ by {np.rad2deg(np.median(errors)):.0f} degrees (median) from those of "
+        "the original frames; were the boxes turned back in part?"
     )
 
 

@@ -35,6 +35,8 @@ _LARGEST_ERROR = 0.01
 # Below this angle between the camera's y axis and the horizontal plane, an angle about that axis is
 # not a heading.
 _LEAST_UPRIGHT_RAD = np.deg2rad(5)
+# A camera that looks along x within this angle shows no difference between meanings of rotation_y.
+_AHEAD_RAD = np.deg2rad(5)
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,21 @@ def check_rotation_y(value: str, setting: str = "dataset.options.rotation_y") ->
         raise ConfigError(
             f"{setting} '{value}': use one of {', '.join(names)}{did_you_mean(value, names)}"
         )
+
+
+def rotation_y_of_tools(calibration: Calibration) -> RotationY:
+    """Return how rotation_y of a detector's results is most likely meant in augmented copies.
+
+    Results of the frames themselves do not show it if the camera looks along x. The tools that
+    write such files for LiDAR detectors use OpenPCDet's formula.
+
+    Args:
+        calibration: calibration of a frame, with the meaning in its label files.
+    """
+    if calibration.rotation_y != "calibration":
+        return calibration.rotation_y
+    ahead = abs(Mounting.of(calibration).yaw_rad) < _AHEAD_RAD
+    return "openpcdet" if ahead else "calibration"
 
 
 def check_lidar_to_camera(matrix: Float[np.ndarray, "4 4"], place: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from curate.category_names import NameFinding, renamed
 from curate.detections import Detections
-from curate.detectors.base import Detector, RecordedViews
+from curate.detectors.base import CopiesDetector, Detector, RecordedViews
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import ConfigError, CurateError
 from curate.evaluation.camera_examination import examine_camera
@@ -17,8 +17,10 @@ from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.geometry.augmented_views import augmented_frame
+from curate.geometry.similarity import Similarity
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import (
+    Place,
     check_detector,
     check_segmenter,
     open_detector,
@@ -36,6 +38,8 @@ from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
 
+# A of the copy on which a detector that runs elsewhere is tried.
+_TURNED = Similarity(flip_y=True, rotation_rad=0.4, scale=1.03)
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
 # Frames with recorded results that are checked together with the frame.
@@ -131,7 +135,8 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     number, _ = choose_round(workspace, None, None)
-    detector = open_detector(config, newest_checkpoint(workspace), number)
+    place = Place(workspace.root, number, copies=True)
+    detector = open_detector(config, newest_checkpoint(workspace), place)
     missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)
     found = renamed(detector.predict(seen), config.detector.rename)
@@ -146,6 +151,8 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     checked(found, config, detector)
     if isinstance(detector, RecordedDetector) and detector.lacks_copy(frame.frame_id):
         findings.append(Finding("views", "ok", "the augmented copies are those of another split"))
+    elif isinstance(detector, CopiesDetector):
+        findings += _copy(detector, seen, found, config)
     elif isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
         findings.append(
@@ -161,6 +168,28 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
                 if finding.check == "boxes" and finding.state == "wrong"
             ]
     return findings
+
+
+def _copy(
+    detector: CopiesDetector, frame: Frame, found: Detections, config: Config
+) -> list[Finding]:
+    """Run a detector that runs elsewhere on a turned copy of the frame, and check its boxes."""
+    [copy] = detector.predict_copies({frame.frame_id: _TURNED}, view=1)
+    if isinstance(copy, CurateError):
+        return [Finding("views", "wrong", str(copy))]
+    copy = renamed(copy, config.detector.rename)
+    if len(found) and np.array_equal(copy.boxes, found.boxes):
+        message = (
+            "the boxes of a turned copy are those of the frame: the command must read the frames "
+            "in {data} or {clouds}, not the data set"
+        )
+        return [Finding("views", "wrong", message)]
+    wrong = [
+        finding
+        for finding in examine_detections(augmented_frame(frame, _TURNED), copy, ())
+        if finding.check == "boxes" and finding.state == "wrong"
+    ]
+    return wrong or [Finding("views", "ok", f"{len(copy)} boxes in a turned copy of this frame")]
 
 
 def _other_results(

@@ -29,10 +29,12 @@ from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import box_rectangles
-from pipelines.engine.executors.base import FrameJob, batches_for
+from pipelines.assembly import Place
+from pipelines.engine.executors.base import FrameJob
+from pipelines.engine.mapping import map_frames
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import stored_round
+from pipelines.engine.rounds import choose_round, stored_round
 from pipelines.engine.runner import open_executor
 from pipelines.round import graph_of
 from pipelines.stages.predict import Predict, as_detections
@@ -96,18 +98,21 @@ def rectangles_in_image(boxes: np.ndarray, frame: Frame) -> np.ndarray | None:
     return None if frame.image_size is None else box_rectangles(boxes, frame)
 
 
-def detect_val(workspace: Workspace, path: Path, progress: Progress) -> dict[str, Detections]:
+def detect_val(
+    workspace: Workspace, path: Path | None, progress: Progress
+) -> dict[str, Detections]:
     """Return the detections of a checkpoint in the val frames, by frame name.
 
     Raises:
         FramesFailed: if the detector failed on some frames.
     """
     frames = workspace.frames("val")
-    predict = Predict(workspace.config, path)
+    number, _ = choose_round(workspace, None, None)
+    predict = Predict(workspace.config, path, Place(workspace.root, number))
     jobs = [FrameJob(key, name) for name, key in frames.items()]
     found: dict[str, Detections] = {}
     with progress.track("evaluate", len(jobs)) as advance, open_executor(workspace) as executor:
-        for outcome in executor.map(predict, batches_for(predict, jobs)):
+        for outcome in map_frames(executor, predict, jobs, len(jobs)):
             if outcome.error is not None:
                 raise FramesFailed(f"val {outcome.job.title}: {outcome.error}")
             for frame, rows in zip(outcome.job.frames, outcome.rows, strict=True):

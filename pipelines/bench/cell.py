@@ -123,7 +123,7 @@ def _copy_database(source: Path, target: Path) -> None:
         old.backup(new)
 
 
-def _evaluate(workspace: Workspace, checkpoint: Path, progress: Metered) -> Evaluated:
+def _evaluate(workspace: Workspace, checkpoint: Path | None, progress: Metered) -> Evaluated:
     """Evaluate a detector on val, at the configured and at the relaxed IoU thresholds."""
     objects = val_objects(workspace, detect_val(workspace, checkpoint, progress))
     thresholds = {"kitti": dict(objects.overlaps), "loose": relaxed(objects.overlaps)}

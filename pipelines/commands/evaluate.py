@@ -301,9 +301,9 @@ def _evaluate_val(
         detections = stored_val(workspace, round_number)
     else:
         path = checkpoint or newest_checkpoint(workspace)
-        if not path.exists():
+        if path is not None and not path.exists():
             raise WorkspaceError(f"--checkpoint {path}: no such file")
-        source = workspace.relative(path)
+        source = workspace.relative(path) if path else workspace.config.detector.name
         detections = detect_val(workspace, path, Bar())
     objects = val_objects(workspace, detections)
     found = _compare(objects)

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, func, select
 import curate
 from curate.errors import WorkspaceError
 from db import bulk
-from pipelines.assembly import trainable_detector
+from pipelines.assembly import runs_elsewhere, trainable_detector
 from pipelines.engine.stage import RoundContext, Teacher
 from pipelines.workspace.workspace import Workspace, sha256
 
@@ -105,7 +105,7 @@ def _recorded_config(workspace: Workspace) -> str:
     """
     exclude = {
         "run": {"executor", "workers", "database"},
-        "detector": {"batch_size"},
+        "detector": {"batch_size", "workers", "timeout_s"},
         "train": {"threads"},
     }
     return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))
@@ -162,7 +162,7 @@ def find_teacher(
     supplied = not is_pretrained(workspace)
     if supplied and number == 1:
         key, teacher = _external_detector(workspace, record=for_use)
-        if for_use and trainable:
+        if for_use and trainable and teacher.path:
             trainable.detector.check_checkpoint(teacher.path)
         return key, teacher
     table = bulk.table("checkpoint")
@@ -196,8 +196,10 @@ def find_teacher(
     return key, Teacher(file, digest)
 
 
-def newest_checkpoint(workspace: Workspace) -> Path:
+def newest_checkpoint(workspace: Workspace) -> Path | None:
     """Return the file of the newest student under the configured policy, or the first teacher's.
+
+    None for a command without a checkpoint.
 
     Raises:
         WorkspaceError: if no detector exists yet.
@@ -226,6 +228,8 @@ def register_checkpoint(
 def _external_detector(workspace: Workspace, *, record: bool) -> tuple[int | None, Teacher]:
     """Return the key and the file of the detector that the user supplied."""
     path = workspace.config.detector.path
+    if path is None and runs_elsewhere(workspace.config):
+        return None, Teacher(None, "")
     if path is None:
         raise WorkspaceError(
             f"detector '{workspace.config.detector.name}' needs a path: set detector.path in "

@@ -21,14 +21,13 @@ from pipelines.engine.executors.base import (
     Executor,
     FrameJob,
     FrameRows,
-    Job,
     JobFunction,
     Outcome,
     Part,
     SequenceJob,
-    batches_for,
 )
 from pipelines.engine.executors.serial import SerialExecutor
+from pipelines.engine.mapping import map_frames
 from pipelines.engine.plan import Plan, TaskKey, WaitingFrame, digest, is_current
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import (
@@ -127,11 +126,13 @@ def run_frames(
                 advance(len(keys), "")
 
             if total:
-                for outcome in _outcomes(plan, stage, split, total, executor, skip):
-                    writer.add(outcome)
-                    failed = f"{writer.failed} failed" if writer.failed else ""
-                    advance(len(outcome.job.frames), failed)
-                writer.flush()
+                try:
+                    for outcome in _outcomes(plan, stage, split, total, executor, skip):
+                        writer.add(outcome)
+                        failed = f"{writer.failed} failed" if writer.failed else ""
+                        advance(len(outcome.job.frames), failed)
+                finally:  # also after an error or Ctrl-C: finished frames are kept
+                    writer.flush()
         return Report(
             stage=stage.name,
             round=number,
@@ -242,11 +243,10 @@ def _outcomes(
     else:
         frames = plan.waiting_frames(stage, split, measured=False)
         jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip)
-    # Start the executor, which loads the models, only if there is a first job.
+    # Load the models only if there is a first job.
     for first in jobs:
         function: JobFunction = stage.function(plan.workspace, plan.context)
-        batches = batches_for(function, chain([first], jobs))
-        yield from executor.map(function, _Counted(batches, total))
+        yield from map_frames(executor, function, chain([first], jobs), total)
     if isinstance(stage, SequenceStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)
@@ -254,32 +254,6 @@ def _outcomes(
     for first in jobs:
         function = stage.reusable.function(plan.workspace, plan.context)
         yield from SerialExecutor().map(function, chain([first], jobs))
-
-
-class _Counted(Iterator[Job]):
-    """Jobs with `operator.length_hint`, the expected number of jobs that are left.
-
-    Args:
-        jobs: the jobs.
-        frames: number of their frames; a sequence has several.
-    """
-
-    def __init__(self, jobs: Iterable[Job], frames: int) -> None:
-        self._jobs = iter(jobs)
-        self._left = frames
-        self._jobs_taken = self._frames_taken = 0
-
-    def __next__(self) -> Job:
-        """Return the next job."""
-        job = next(self._jobs)
-        self._jobs_taken += 1
-        self._frames_taken += len(job.frames)
-        return job
-
-    def __length_hint__(self) -> int:
-        """Return the expected number of jobs that are left."""
-        left = max(0, self._left - self._frames_taken)
-        return round(left * self._jobs_taken / self._frames_taken) if self._frames_taken else left
 
 
 def _frame_jobs(
@@ -337,7 +311,9 @@ class _Writer:
     def add(self, outcome: Outcome) -> None:
         """Add an outcome to the batch, and write the batch if it is due."""
         self._pending.append(outcome)
-        if len(self._pending) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S:
+        if outcome.ends_job and (
+            len(self._pending) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S
+        ):
             self.flush()
 
     def skip(self, keys: Sequence[int]) -> None:
@@ -425,7 +401,7 @@ class _Writer:
         )
 
     def _task(
-        self, key: int, state: str, error: str | None, seconds: float, job: Job | None = None
+        self, key: int, state: str, error: str | None, seconds: float, job: Part | None = None
     ) -> dict[str, Any]:
         """Return a row of `task`; for a stage of sequences its variant is the sequence."""
         return {

@@ -21,11 +21,12 @@ class Teacher:
     """The detector that predicts in a round.
 
     Attributes:
-        path: its checkpoint, or the file or folder that the user supplied.
-        sha256: hash of that file or folder.
+        path: its checkpoint, or the file or folder that the user supplied; None for a command
+            without one.
+        sha256: hash of that file or folder; "" without one.
     """
 
-    path: Path
+    path: Path | None
     sha256: str
 
 

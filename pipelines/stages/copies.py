@@ -5,22 +5,18 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from curate.datasets.copies import copy_kind
-from curate.datasets.manifest import NAME, Manifest, identity_of, view_folder
+from curate.datasets.manifest import NAME, Manifest, sample_hashes, view_folder
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError, DataError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
-    describe_few_matches,
-    examine_copied_headings,
-    examine_copies,
+    examine_view,
 )
-from curate.frames import Calibration, RotationY
+from curate.frames import RotationY
 from curate.geometry.augmented_views import AugmentedViews
-from curate.geometry.mounting import Mounting
-from pipelines.assembly import copies_folder, open_detector
+from curate.geometry.mounting import rotation_y_of_tools
+from pipelines.assembly import Place, copies_folder, open_detector
 from pipelines.engine.stage import RoundContext
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, sha256
@@ -29,8 +25,6 @@ _log = logging.getLogger(__name__)
 
 # Frames with results that are compared with those of their copies.
 _COMPARED = 64
-# A camera that looks along x within this angle shows no difference between meanings of rotation_y.
-_AHEAD_RAD = np.deg2rad(5)
 
 
 def augmented_views(config: Config, seed: int, round_number: int) -> AugmentedViews:
@@ -57,29 +51,17 @@ def manifest_of(
     config, dataset = workspace.config, workspace.dataset
     drawn = augmented_views(config, config.run.seed, round_number)
     frames = list(workspace.frames(split))
+    declared: RotationY | None = config.detector.options.get("rotation_y")
     return Manifest(
         split,
         drawn,
         camera_view,
         config.dataset.kind,
-        identity_of(dataset, frames),
+        sample_hashes(dataset, frames),
         copy_kind(dataset),
-        _rotation_y(config, dataset.read(frames[0], points=False).calibration),
+        declared or rotation_y_of_tools(dataset.read(frames[0], points=False).calibration),
         {name: drawn.draw(name) for name in frames},
     )
-
-
-def _rotation_y(config: Config, calibration: Calibration) -> RotationY:
-    """Return how rotation_y of results in KITTI's form is most likely meant.
-
-    Results of the frames themselves do not show it if the camera looks along x. The tools that
-    write such files for LiDAR detectors use OpenPCDet's formula.
-    """
-    declared: RotationY | None = config.detector.options.get("rotation_y")
-    if declared is not None or calibration.rotation_y != "calibration":
-        return declared or calibration.rotation_y
-    ahead = abs(Mounting.of(calibration).yaw_rad) < _AHEAD_RAD
-    return "openpcdet" if ahead else "calibration"
 
 
 def copies_fingerprint(folder: Path) -> str:
@@ -105,7 +87,8 @@ def check_copies(workspace: Workspace, context: RoundContext, split: str) -> Non
     if difference:
         command = f"curate augment FOLDER --round {context.number} --split {split}"
         raise DataError(f"{folder / NAME}: {difference}; write the copies with `{command}`")
-    detector = open_detector(workspace.config, context.teacher.path, context.number)
+    place = Place(workspace.root, context.number, copies=True)
+    detector = open_detector(workspace.config, context.teacher.path, place)
     if not isinstance(detector, RecordedDetector):
         return
     for view, results in enumerate(detector.views_of_copies):
@@ -131,7 +114,7 @@ def _problem(
     """Return in which way the results of a view do not belong to its copies; "" if they do."""
     chosen = frames[:: max(1, len(frames) // _COMPARED)]
 
-    def read(meaning: RotationY | None = None) -> list[CopiedFrame]:
+    def read(meaning: RotationY | None) -> list[CopiedFrame]:
         found = []
         for name in chosen:
             try:
@@ -142,7 +125,7 @@ def _problem(
             found.append(CopiedFrame(plain, copy, manifest.frames[name]))
         return found
 
-    compared = read()
-    if few := describe_few_matches(view, compared):
-        _log.warning("%s: %s", detector.views_of_copies[view].path, few)
-    return examine_copies(view, compared) or examine_copied_headings(view, compared, read)
+    problem, remark = examine_view(view, read)
+    if remark and not problem:
+        _log.warning("%s: %s", detector.views_of_copies[view].path, remark)
+    return problem

@@ -1,26 +1,32 @@
 """Training of students by the user's own command (`train.command`).
 
-The command is split like in a shell (shlex), but no shell runs it: there are no pipes, variables or
-globs. In its arguments {labels}, {output}, {teacher}, {round} and {policy} are replaced by their
-values. A value with spaces stays within its argument. The values are also in the environment, as
-CURATE_LABELS and so on. The command runs in the current folder, and its output goes to standard
+`curate.files.user_command` says how a command is split, filled and run. Its output goes to standard
 error.
 """
 
-import os
-import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
-from curate.errors import ConfigError, TrainerFailed
+from curate.errors import TrainerFailed
+from curate.files.user_command import UserCommand, describe_end
 from pipelines.engine.stage import RoundJob
 from pipelines.registry import EXPORTERS
 from pipelines.stages import export
 from pipelines.workspace.workspace import Workspace
 
 _STANDARD_ERROR = 2
+
+
+def trainer_command(command: str) -> UserCommand:
+    """Return the configured command.
+
+    Raises:
+        ConfigError: if it cannot be parsed, or its program does not exist.
+    """
+    parsed = UserCommand.parse("train command", command)
+    parsed.check_program()
+    return parsed
 
 
 def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
@@ -31,51 +37,28 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
     training succeeds.
 
     Raises:
-        ConfigError: if the command cannot be parsed or started.
+        ConfigError: if the command cannot be parsed, or its program does not exist.
         TrainerFailed: if it ends with an error, or does not write its output.
     """
     draft = output.parent / "training" / output.name
     values = {
         "labels": str(_labels(workspace, job)),
         "output": str(draft),
-        "teacher": str(job.context.teacher.path),
+        "teacher": str(job.context.teacher.path or ""),
         "round": str(job.context.number),
         "policy": job.policy,
     }
-    arguments = split_command(workspace.config.train.command or "", values)
+    command = trainer_command(workspace.config.train.command or "")
     draft.parent.mkdir(parents=True, exist_ok=True)
     before = _state(draft)
-    _run(arguments, values)
+    sys.stderr.flush()
+    if code := command.run(values, _STANDARD_ERROR):
+        raise TrainerFailed(
+            f"the trainer {command.short} ended with {describe_end(code)}; see its output above, "
+            "fix the cause and rerun the command"
+        )
     _check(draft, before)
     _take_place(draft, output)
-
-
-def split_command(command: str, values: dict[str, str]) -> list[str]:
-    """Return the arguments of a command, with each {name} replaced by its value.
-
-    Braces with other names stay as they are.
-
-    Raises:
-        ConfigError: if a quote is not closed, or the command is empty.
-    """
-    try:
-        arguments = shlex.split(command)
-    except ValueError as error:
-        raise ConfigError(f"train command `{command}`: {error}; fix its quotes") from None
-    if not arguments:
-        raise ConfigError("train command: is empty; write a program and its arguments")
-    return [_filled(argument, values) for argument in arguments]
-
-
-def _filled(argument: str, values: dict[str, str]) -> str:
-    """Replace {names} in one pass, so that a value which contains a {name} is not changed."""
-    head, brace, rest = argument.partition("{")
-    name, end, tail = rest.partition("}")
-    if not brace:
-        return head
-    if end and name in values:
-        return head + values[name] + _filled(tail, values)
-    return head + brace + _filled(rest, values)
 
 
 def _labels(workspace: Workspace, job: RoundJob) -> Path:
@@ -87,26 +70,6 @@ def _labels(workspace: Workspace, job: RoundJob) -> Path:
     path = export.default_path(workspace, job.context.number, job.policy, exporter)
     export.export_as(workspace, exporter, job.context.number, job.policy, path)
     return path
-
-
-def _run(arguments: list[str], values: dict[str, str]) -> None:
-    environment = {f"CURATE_{name.upper()}": value for name, value in values.items()}
-    sys.stderr.flush()
-    try:
-        result = subprocess.run(  # noqa: S603 - the user's own command, without a shell
-            arguments, env=os.environ | environment, stdout=_STANDARD_ERROR, check=False
-        )
-    except OSError as error:
-        raise ConfigError(
-            f"train command: {arguments[0]} cannot be started: {error.strerror}"
-        ) from None
-    if result.returncode:
-        code = result.returncode
-        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
-        raise TrainerFailed(
-            f"the trainer {shlex.join(arguments[:2])} ended with {reason}; see its output above, "
-            "fix the cause and rerun the command"
-        )
 
 
 def _check(draft: Path, before: tuple[int, int] | None) -> None:

@@ -9,15 +9,21 @@ import numpy as np
 
 from curate.category_names import renamed
 from curate.detections import Detections
-from curate.detectors.base import BatchDetector, Detector, NamesCategories
+from curate.detectors.base import BatchDetector, CopiesDetector, Detector, NamesCategories
 from curate.detectors.devices import AUTO
 from curate.detectors.precision import FLOAT32
-from curate.errors import CurateError, ModelError
+from curate.errors import ConfigError, CurateError, ModelError, error_prefix
 from curate.frames import Frame
 from curate.geometry.projection import in_camera_view
 from curate.warnings_once import warn_once
 from db.models import BOX_COLUMNS
-from pipelines.assembly import batch_size, check_detector, open_detector
+from pipelines.assembly import (
+    Place,
+    batch_size,
+    check_detector,
+    open_detector,
+    runs_elsewhere,
+)
 from pipelines.category_names import check_detector_names
 from pipelines.devices import detector_place
 from pipelines.engine.executors.base import FrameJob, FrameRows
@@ -28,8 +34,11 @@ from pipelines.workspace.workspace import Workspace, open_dataset, sha256
 
 Item = TypeVar("Item")
 
-# Settings of detectors and segmenters that change no result, or are stored with it by themselves.
-_WITHOUT_EFFECT = ("path", "augmented", "batch_size", "providers")
+# Settings of detectors and segmenters that change no result, and the path, of which the content
+# counts.
+_WITHOUT_EFFECT = ("path", "augmented", "batch_size", "workers", "timeout_s", "providers")
+# Frames of the first batch of a command.
+TRIAL_FRAMES = 8
 
 
 @dataclass
@@ -38,19 +47,19 @@ class Predict:
 
     Attributes:
         config: the configuration.
-        teacher: checkpoint of the teacher.
-        copies_of: see `open_detector`.
+        teacher: checkpoint of the teacher; None for a command without one.
+        place: workspace and round.
     """
 
     config: Config
-    teacher: Path
-    copies_of: int | None = None
+    teacher: Path | None
+    place: Place
 
     def open(self) -> None:
         """Open the data set and load the detector."""
         self.dataset = open_dataset(self.config)
         self.read = FrameReader(self._read)
-        self.detector = open_detector(self.config, self.teacher, self.copies_of)
+        self.detector = open_detector(self.config, self.teacher, self.place)
         check_detector_names(self.config, self.detector)
 
     @property
@@ -58,9 +67,37 @@ class Predict:
         """How many frames the detector gets at a time."""
         return batch_size(self.config)
 
+    @property
+    def workers(self) -> int | None:
+        """How many workers run the detector at the same time; a command may need the whole GPU."""
+        configured = self.config.detector.workers
+        if configured == "auto":
+            return 1 if runs_elsewhere(self.config) or self.exclusive else None
+        return configured
+
+    @property
+    def trial_size(self) -> int:
+        """How many frames are tried first, to find out in seconds that a command is wrong."""
+        return TRIAL_FRAMES if runs_elsewhere(self.config) else 0
+
+    def trial(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
+        """Return the rows of the first frames.
+
+        Raises:
+            CurateError: if the detector is wrong, or all frames fail.
+        """
+        rows = self.batch(jobs)
+        raise_errors_of_detector(rows)
+        return rows
+
     def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
         """Return the rows of `prediction` of each frame."""
-        found = self.detect([self.read(job.frame) for job in jobs])
+        names = [job.frame for job in jobs]
+        found: Sequence[Detections | CurateError]
+        if isinstance(self.detector, CopiesDetector):
+            found = self.detector.predict_copies(dict.fromkeys(names))
+        else:
+            found = self.detect([self.read(name) for name in names])
         return for_each(self._rows, found)
 
     @property
@@ -113,6 +150,18 @@ def _rows_or_error(function: Callable[[Item], FrameRows], item: Item) -> FrameRo
         return function(item)
     except CurateError as error:
         return error
+
+
+def raise_errors_of_detector(rows: Sequence[FrameRows | CurateError]) -> None:
+    """Raise an error of the first frames that later ones would have as well.
+
+    Raises:
+        CurateError: if the detector cannot be used as it is, or all frames fail.
+    """
+    errors = [each for each in rows if isinstance(each, CurateError)]
+    for error in errors:
+        if isinstance(error, ModelError | ConfigError) or len(errors) == len(rows):
+            raise error
 
 
 def visible(frame: Frame, config: Config) -> Frame:
@@ -207,7 +256,7 @@ def settings(workspace: Workspace, _context: RoundContext) -> Settings:
     config = workspace.config
     return {
         "detector": settings_of_results(config.detector),
-        "files": option_files(config),
+        "files": option_files(workspace),
         "categories": config.dataset.categories,
     }
 
@@ -226,8 +275,17 @@ def settings_of_results(section: DetectorSection | SegmenterSection) -> Settings
     return {**found, "device": AUTO} if "device" in found else found
 
 
-def option_files(config: Config) -> dict[str, str]:
-    """Return the hashes of the files in the detector's options, by their paths in the options."""
+def option_files(workspace: Workspace) -> dict[str, str]:
+    """Return the hashes of the files in the detector's options, by their paths in the options.
+
+    Raises:
+        ConfigError: if a file on which a command depends does not exist.
+    """
+    config = workspace.config
+    if runs_elsewhere(config):
+        listed = config.detector.options.get("files", ())
+        with error_prefix("detector.options.files"):
+            return {name: sha256(workspace.root / name) for name in listed}
     path = config.detector.path
     if path is None:
         return {}
@@ -253,9 +311,18 @@ def check(workspace: Workspace) -> None:
     Raises:
         ConfigError: if it cannot.
     """
-    check_detector(workspace.config)
+    config = workspace.config
+    check_detector(config)
+    option_files(workspace)
+    command = config.detector.options.get("command", "")
+    ignores_students = "{" in command and "{teacher}" not in command
+    if runs_elsewhere(config) and config.train.command and ignores_students:
+        warn_once(
+            "detector.options.command does not use {teacher}: the students of train.command would "
+            "not predict in the next rounds"
+        )
 
 
 def function(workspace: Workspace, context: RoundContext) -> Predict:
     """Return what predict does with a frame."""
-    return Predict(workspace.config, context.teacher.path)
+    return Predict(workspace.config, context.teacher.path, Place(workspace.root, context.number))

@@ -8,14 +8,27 @@ import numpy as np
 
 from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
-from curate.detectors.base import RecordedViews
-from curate.errors import CurateError, WorkspaceError
+from curate.detectors.base import CopiesDetector, RecordedViews
+from curate.errors import CurateError, ModelError, WorkspaceError
+from curate.evaluation.copy_examination import (
+    CopiedFrame,
+    examine_view,
+)
+from curate.frames import RotationY
+from curate.geometry.augmented_views import augmented_calibration
+from curate.geometry.mounting import rotations_y_of_yaws, yaws_of_rotations_y
 from curate.geometry.similarity import Similarity
-from pipelines.assembly import consistency_settings, copies_folder
+from curate.warnings_once import warn_once
+from pipelines.assembly import Place, consistency_settings, copies_folder, runs_elsewhere
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.stages.copies import augmented_views, copies_fingerprint
-from pipelines.stages.predict import Predict, detection_columns, for_each
+from pipelines.stages.predict import (
+    Predict,
+    detection_columns,
+    for_each,
+    raise_errors_of_detector,
+)
 from pipelines.workspace.workspace import Workspace
 
 View = tuple[Similarity, Detections | CurateError]
@@ -24,15 +37,33 @@ View = tuple[Similarity, Detections | CurateError]
 class Repredict(Predict):
     """Predicts augmented copies of frames, and compares them with the frames' predictions."""
 
-    def __init__(self, predict: Predict, seed: int, round_number: int) -> None:
-        super().__init__(predict.config, predict.teacher, round_number)
+    def __init__(self, predict: Predict, seed: int) -> None:
+        super().__init__(predict.config, predict.teacher, replace(predict.place, copies=True))
         self.seed = seed
-        self.round_number = round_number
 
     @property
     def batch_size(self) -> int:
-        """How many frames have together as many copies as the detector gets at a time."""
-        return max(1, super().batch_size // self.config.repredict.views)
+        """How many frames have together as many copies as the detector gets at a time.
+
+        A command gets one view at a time.
+        """
+        size = super().batch_size
+        return size if runs_elsewhere(self.config) else max(1, size // self.config.repredict.views)
+
+    def trial(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
+        """Return the rows of the first frames.
+
+        Raises:
+            CurateError: if the detector is wrong, all frames fail, or the results do not belong to
+                the copies.
+        """
+        views = self.views([job.frame for job in jobs])
+        rows = for_each(lambda each: self._compared(*each), zip(jobs, views, strict=True))
+        raise_errors_of_detector(rows)
+        if isinstance(self.detector, CopiesDetector):
+            for view in range(self.config.repredict.views):
+                self._check_copies(self.detector, jobs, views, view)
+        return rows
 
     def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
         """Return the rows of `reprediction_view`, `reprediction` and `consistency`, by frame."""
@@ -43,10 +74,77 @@ class Repredict(Predict):
         """Return for each frame its similarities A, with what the detector finds in A(x)."""
         if isinstance(self.detector, RecordedViews):
             return [self.detector.views(frame_id) for frame_id in frame_ids]
-        drawn = augmented_views(self.config, self.seed, self.round_number)
+        drawn = augmented_views(self.config, self.seed, self.place.round_number)
+        if isinstance(self.detector, CopiesDetector):
+            return self._views_elsewhere(
+                self.detector, {each: drawn.draw(each) for each in frame_ids}
+            )
         copies = [[*drawn.copies(self.read(frame_id))] for frame_id in frame_ids]
         found = iter(self.detect([copy for each in copies for _, copy in each]))
         return [[(a, next(found)) for a, _ in each] for each in copies]
+
+    def _views_elsewhere(
+        self, detector: CopiesDetector, drawn: Mapping[str, Sequence[Similarity]]
+    ) -> list[Sequence[View]]:
+        found = [
+            detector.predict_copies({name: each[view] for name, each in drawn.items()}, view + 1)
+            for view in range(self.config.repredict.views)
+        ]
+        return [
+            list(zip(similarities, of_frame, strict=True))
+            for similarities, of_frame in zip(drawn.values(), zip(*found, strict=True), strict=True)
+        ]
+
+    def _check_copies(
+        self,
+        detector: CopiesDetector,
+        jobs: Sequence[FrameJob],
+        views: Sequence[Sequence[View]],
+        view: int,
+    ) -> None:
+        """Check that the results of a view belong to its copies.
+
+        Raises:
+            ModelError: if they do not, or their headings have another meaning.
+        """
+
+        def read(meaning: RotationY | None) -> list[CopiedFrame]:
+            frames = []
+            for job, found in zip(jobs, views, strict=True):
+                similarity, copy = found[view]
+                if isinstance(copy, CurateError) or job.predictions is None:
+                    continue
+                copy = self.checked(copy)
+                if meaning is not None:
+                    copy = self._read_as(meaning, detector, job.frame, similarity, copy)
+                frames.append(CopiedFrame(job.predictions, copy, [a for a, _ in found]))
+            return frames
+
+        problem, remark = examine_view(view, read)
+        if problem:
+            setting = "detector.options.rotation_y"
+            problem = problem.replace(setting, "detector.options.results.rotation_y")
+            raise ModelError(f"detector.options.command, view {view + 1}: {problem}")
+        if remark:
+            warn_once(f"detector.options.command, view {view + 1}: {remark}")
+
+    def _read_as(
+        self,
+        meaning: RotationY,
+        detector: CopiesDetector,
+        frame_id: str,
+        similarity: Similarity,
+        found: Detections,
+    ) -> Detections:
+        """Return the detections of a copy with rotation_y of their file in another meaning."""
+        calibration = self.dataset.read(frame_id, points=False).calibration
+        copied = augmented_calibration(calibration, similarity)
+        boxes = found.boxes.copy()
+        rotations_y = rotations_y_of_yaws(
+            boxes[:, 6], copied, detector.rotation_y_of_copies(calibration)
+        )
+        boxes[:, 6] = yaws_of_rotations_y(rotations_y, copied, meaning)
+        return replace(found, boxes=boxes)
 
     def _compared(self, job: FrameJob, found: Sequence[View]) -> FrameRows:
         """Return the rows of a frame."""
@@ -88,8 +186,8 @@ def settings(workspace: Workspace, context: RoundContext) -> Settings:
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:
     """Return what repredict does with a frame."""
-    predict = Predict(workspace.config, context.teacher.path)
-    return Repredict(predict, context.seed, context.number)
+    place = Place(workspace.root, context.number)
+    return Repredict(Predict(workspace.config, context.teacher.path, place), context.seed)
 
 
 def _reprediction_columns(view: int, found: Detections, loss: Consistency) -> dict[str, list[Any]]:

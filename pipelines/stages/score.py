@@ -71,6 +71,11 @@ class Score:
         place = segmenter_place(self.config) if PRIORS.takes(self.source, "segmenter") else None
         return place is not None and place.exclusive
 
+    @property
+    def workers(self) -> int | None:
+        """How many workers run the segmenter at the same time."""
+        return 1 if self.exclusive else None
+
     def prefetch(self, jobs: Sequence[FrameJob]) -> None:
         """Begin to read the frames of the next call."""
         self.read.announce(job.frame for job in jobs)

@@ -26,7 +26,7 @@ from pipelines.engine.progress import Progress, as_total
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
-from pipelines.stages.external_trainer import train_externally
+from pipelines.stages.external_trainer import train_externally, trainer_command
 from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.stages.vanished import check_labels
 from pipelines.workspace.config import TrainSection
@@ -102,12 +102,13 @@ def check(workspace: Workspace, policy: str) -> None:
     """Check the policy, and the settings of curate's trainer or of the user's.
 
     Raises:
-        ConfigError: if the policy or the label format cannot be used, or the trainer does not have
-            a setting.
+        ConfigError: if the policy or the label format cannot be used, the trainer does not have a
+            setting, or its command cannot be started.
     """
     config = workspace.config
     check_policy(config, policy)
     if config.train.command is not None:
+        trainer_command(config.train.command)
         check_labels_format(config, workspace.dataset)
     elif trainable_detector(config):
         section, method = config.train, method_of(config, policy)

@@ -238,6 +238,18 @@ class DetectorSection(Section):
         "detector prefers on its device. It changes no prediction.",
         json_schema_extra=_unit("frames"),
     )
+    workers: AtLeastOne | Literal["auto"] = Field(
+        default="auto",
+        description="The most workers of run.workers that run the detector at the same time. "
+        "'auto': all of them, but one for a model on a GPU, and for a command, which may need the "
+        "whole GPU.",
+        json_schema_extra=_unit("workers"),
+    )
+    timeout_s: Positive = Field(
+        default=3600.0,
+        description="Seconds after which a command that has not finished a batch is ended.",
+        json_schema_extra=_unit("s"),
+    )
     camera_view: bool = Field(
         default=True,
         description="Whether the detector gets only the points that the camera sees.",

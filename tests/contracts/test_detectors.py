@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 from contracts.samples import assert_one_line, assert_same, sample_of
+from support.external_detector import command_of, write_script
 from support.tiny_onnx import tiny_detector
+from support.toys import write_toy_kitti
 
+from curate.datasets.kitti.dataset import KittiDataset
 from curate.detections import CATEGORIES, Detections
-from curate.detectors.base import BatchDetector, RecordedViews
+from curate.detectors.base import BatchDetector, CopiesDetector, RecordedViews
 from curate.detectors.pillars.checkpoint import save_checkpoint
 from curate.detectors.pillars.network import PillarNetwork, checkpoint_of
 from curate.detectors.pillars.presets import PRESETS
@@ -62,11 +65,22 @@ def write_onnx(folder: Path, frames: Sequence[Frame]) -> Path:
     return path
 
 
+def write_command(folder: Path, frames: Sequence[Frame]) -> Path:
+    """Write a script that finds the objects of the test frames, and the frames as a data set."""
+    write_toy_kitti(folder, frames=len(frames))
+    return write_script(folder)
+
+
 # Write the file from which the detector is created, for the test frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "pillars": write_checkpoint,
     "recorded": write_record,
     "onnx": write_onnx,
+    "command": write_command,
+}
+# Options that a detector needs besides, for its file.
+OPTIONS: Mapping[str, Callable[[Path], Mapping[str, object]]] = {
+    "command": lambda path: {"command": command_of(path)},
 }
 
 
@@ -77,8 +91,11 @@ def build(name: str, path: Path, minimum_score: float = 0.1):
         "device": lambda: "cpu",
         "categories": lambda: CATEGORIES,
         "threads": lambda: 1,
+        "open_dataset": lambda: lambda: KittiDataset(path.parents[1]),
+        "folder": lambda: path.parent,
     }
-    return DETECTORS.build(name, path, offered=offered, options={})
+    options = OPTIONS[name](path) if name in OPTIONS else {}
+    return DETECTORS.build(name, path, offered=offered, options=options)
 
 
 @pytest.fixture(scope="module", params=sorted(DETECTORS.classes))
@@ -171,6 +188,20 @@ def test_scores_below_the_minimum_are_dropped(made, frames) -> None:
     assert np.sort(found.scores).tolist() == kept.tolist()
 
 
+def test_detectors_that_run_elsewhere_find_the_same_in_every_batch(detector, frames) -> None:
+    """The boxes of a turned copy are in its own frame of reference."""
+    if not isinstance(detector, CopiesDetector):
+        pytest.skip("it runs in this process")
+    names = [frame.frame_id for frame in frames]
+    turned = Similarity(rotation_rad=0.5)
+    together = detector.predict_copies(dict.fromkeys(names, turned), view=1)
+    for name, frame, found in zip(names, frames, together, strict=True):
+        check_output(found)
+        assert_same(detector.predict_copies({name: turned}, view=1)[0], found)
+        expected = turned.apply_to_boxes(detector.predict(frame).boxes)
+        np.testing.assert_allclose(found.boxes[:, :3], expected[:, :3], atol=1e-4)
+
+
 def test_recorded_detectors_report_the_similarity_of_each_view(detector, frames) -> None:
     """A detector that dictates the augmentation returns the similarity together with its boxes."""
     if isinstance(detector, RecordedViews):
@@ -185,6 +216,8 @@ def test_recorded_detectors_report_the_similarity_of_each_view(detector, frames)
 def test_an_invalid_detector_file_is_rejected(made, tmp_path: Path, content: bytes | None) -> None:
     """A missing, empty or random file gives a one-line error of the right class."""
     name, path = made
+    if name == "command":
+        pytest.skip("only the command reads the file")
     broken = tmp_path / f"broken{path.suffix}"
     if content is not None:
         broken.write_bytes(content)

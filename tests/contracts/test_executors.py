@@ -160,6 +160,14 @@ def test_only_the_frame_of_a_batch_that_kills_its_workers_fails(
     assert wrong == [12]
 
 
+def test_a_function_can_limit_its_workers(executor: Executor, tmp_path: Path) -> None:
+    """One for a command that needs the whole GPU."""
+    function = SquareBatches(tmp_path, batch_size=2, workers=1)
+    batch_outcomes(executor, function)
+    processes = {path.read_text() for path in tmp_path.iterdir()}
+    assert len(processes) == 1
+
+
 def test_workers_that_die_while_loading_end_the_run(crew: Executor) -> None:
     """A model that does not fit into memory is not loaded again for every frame."""
     with pytest.raises(CurateError, match=r"died while they loaded their models.*fewer workers"):

@@ -11,7 +11,7 @@ from support.tiny_onnx import tiny_detector
 from curate.detectors.devices import check_device_name, choose_device
 from curate.errors import ConfigError, DataError
 from pipelines.assembly import check_detector, check_segmenter, open_detector
-from pipelines.devices import Place, detector_place, idle_gpu, segmenter_place
+from pipelines.devices import ModelPlace, detector_place, idle_gpu, segmenter_place
 from pipelines.stages.predict import settings_of_results
 from pipelines.stages.reading import FrameReader
 from pipelines.stages.train_round import loaders
@@ -34,14 +34,18 @@ def gpu(monkeypatch):
 @pytest.mark.parametrize(
     ("detector", "without", "with_gpu"),
     [
-        ({}, Place(providers="cpu"), Place("cuda")),
-        ({"device": "cpu"}, Place(providers="cpu"), Place(providers="cpu")),
-        ({"device": "cuda:1"}, Place("cuda:1"), Place("cuda:1")),
-        ({"providers": "cuda"}, Place(providers=("cuda",)), Place(providers=("cuda",))),
-        ({"name": "onnx"}, Place(), Place()),
-        ({"name": "onnx", "device": "cpu"}, Place(providers="cpu"), Place(providers="cpu")),
+        ({}, ModelPlace(providers="cpu"), ModelPlace("cuda")),
+        ({"device": "cpu"}, ModelPlace(providers="cpu"), ModelPlace(providers="cpu")),
+        ({"device": "cuda:1"}, ModelPlace("cuda:1"), ModelPlace("cuda:1")),
+        ({"providers": "cuda"}, ModelPlace(providers=("cuda",)), ModelPlace(providers=("cuda",))),
+        ({"name": "onnx"}, ModelPlace(), ModelPlace()),
+        (
+            {"name": "onnx", "device": "cpu"},
+            ModelPlace(providers="cpu"),
+            ModelPlace(providers="cpu"),
+        ),
         ({"name": "recorded", "device": "cpu"}, None, None),
-        ({"name": "support.fake_providers:DetectorInTorch"}, Place("cpu"), Place("cuda")),
+        ({"name": "support.fake_providers:DetectorInTorch"}, ModelPlace("cpu"), ModelPlace("cuda")),
     ],
 )
 def test_one_rule_for_torch_and_onnx_runtime(detector, without, with_gpu, request):
@@ -55,7 +59,7 @@ def test_the_device_chooses_the_provider_of_a_model_in_onnx(monkeypatch):
     """With its number as an option."""
     fake_providers(monkeypatch, FakeRuntime(("CUDA",)))
     found = detector_place(config(detector={"name": "onnx", "device": "cuda:1"}))
-    assert found == Place(None, ("cuda",), {"cuda": {"device_id": 1}})
+    assert found == ModelPlace(None, ("cuda",), {"cuda": {"device_id": 1}})
     assert found.exclusive
     check_detector(config(detector={"name": "onnx", "device": "cuda:1", "path": "a.onnx"}))
 
@@ -141,15 +145,15 @@ def test_results_of_another_device_or_provider_stay_valid():
 def test_an_idle_gpu_is_noticed(monkeypatch):
     """Where NVIDIA's tools are installed, and no model runs on a device of its own."""
     monkeypatch.setattr("pipelines.devices.shutil.which", lambda name: f"/usr/bin/{name}")
-    assert idle_gpu(Place(providers="cpu"), None)
-    assert not idle_gpu(Place("cuda"), Place(providers="cpu"))
+    assert idle_gpu(ModelPlace(providers="cpu"), None)
+    assert not idle_gpu(ModelPlace("cuda"), ModelPlace(providers="cpu"))
     assert not idle_gpu(None, None)
     monkeypatch.setattr("pipelines.devices.shutil.which", lambda name: None)
-    assert not idle_gpu(Place(providers="cpu"))
+    assert not idle_gpu(ModelPlace(providers="cpu"))
 
 
 def test_the_segmenter_that_is_shipped_runs_in_onnx_runtime():
-    assert segmenter_place(config(segmenter={"name": "simulated"})) == Place()
+    assert segmenter_place(config(segmenter={"name": "simulated"})) == ModelPlace()
     assert segmenter_place(config()) is None
 
 
@@ -182,7 +186,7 @@ def test_batches_are_prepared_by_other_processes_where_there_is_a_gpu(
 def test_a_mixed_precision_needs_a_detector_in_torch(gpu, tmp_path):
     """Pillars on the CPU then runs in torch, too; a model in ONNX has the precision of its file."""
     assert detector_place(config(detector={"device": "cpu", "precision": "bfloat16"})) == (
-        Place("cpu")
+        ModelPlace("cpu")
     )
     check_detector(config(detector={"device": "cpu", "precision": "bfloat16"}))
     for other in ({"name": "onnx"}, {"name": "recorded"}, {"providers": ["cpu"]}):

@@ -68,13 +68,16 @@ class SquareBatches:
     """Square the keys of a batch. Some keys fail alone, some spoil their batch or kill the worker.
 
     Attributes:
-        folder: where it records the batches: the first key, and the number of frames.
+        folder: where it records the batches: the first key, the number of frames, the process.
         deadly: frames that kill the worker.
+        batch_size: the most frames of a batch.
+        workers: the most workers that run it at the same time.
     """
 
     folder: Path
     deadly: tuple[int, ...] = ()
     batch_size: int = 8
+    workers: int | None = None
 
     def open(self) -> None:
         """Do nothing."""
@@ -82,7 +85,8 @@ class SquareBatches:
     def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
         """Return one row per frame."""
         keys = [job.frame_id for job in jobs]
-        (self.folder / f"{keys[0]}-{len(keys)}-{uuid.uuid4()}").touch()
+        record = self.folder / f"{keys[0]}-{len(keys)}-{uuid.uuid4()}"
+        record.write_text(str(os.getpid()))
         if any(key in self.deadly for key in keys):
             os.kill(os.getpid(), signal.SIGKILL)
         if any(key % 7 == 3 for key in keys):
@@ -159,9 +163,11 @@ class OnDevice:
 
     Attributes:
         exclusive: whether workers should not share the device.
+        workers: how many of them run it.
     """
 
     exclusive: bool = True
+    workers: int | None = 1
 
     def open(self) -> None:
         """Begin to record."""

@@ -158,6 +158,16 @@ class ToyBatchDetector(ToyDetector):
         ]
 
 
+class RayDetector(ToyDetector):
+    """The toy detector with headings along the ray from the sensor: they turn with the cloud."""
+
+    def predict(self, frame: Frame) -> Detections:
+        """Return one box per category."""
+        found = super().predict(frame)
+        found.boxes[:, 6] = np.arctan2(found.boxes[:, 1], found.boxes[:, 0])
+        return found
+
+
 class ToySegmenter:
     """Segment the left half of every image as car and the right half as person."""
 

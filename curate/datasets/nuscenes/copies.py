@@ -65,6 +65,7 @@ class NuScenesCopies:
     """
 
     kind = "nuscenes"
+    clouds = "samples/LIDAR_TOP"
 
     def __init__(
         self,

@@ -110,6 +110,7 @@ class RecordedDetector:
         augmented: folder of `curate augment` with results of the copies; in place of `passes`.
         frame_ids: the frames of the data set; recorded frames are matched with them in the
             spellings of `curate.datasets.frame_names`, and those of no frame are reported.
+        only_these: whether results of other frames are an error.
         calibration: returns the calibration of a frame id; needed for views in the formats of
             KITTI and nuScenes.
         wants_views: whether the run needs a second pass; if it is missing, a warning is logged.
@@ -138,6 +139,7 @@ class RecordedDetector:
         sigmoid: bool = False,
         augmented: StrPath | None = None,
         frame_ids: Sequence[str] = (),
+        only_these: bool = False,
         calibration: Callable[[str], Calibration] | None = None,
         wants_views: bool = True,
     ) -> None:
@@ -161,15 +163,15 @@ class RecordedDetector:
         )
         self._record = _open(self.path, kind, options, passes)
         # The name in the record of each frame that has another one there.
-        found = self._match(FrameNames.of(frame_ids))
+        found = self._match(FrameNames.of(frame_ids), only_these=only_these)
         self._record.check(found)
         self._recorded_as = {frame: name for name, frame in found.items() if name != frame}
         self._copies: _Copies | None = None
         if augmented is not None:
-            if self._record.has_views:
+            if passes:
                 raise ConfigError(
-                    f"{self.path}: has augmented copies of its own, and detector.augmented is set; "
-                    "remove one of them"
+                    "detector.options.passes and detector.augmented are both set; remove one of "
+                    "them"
                 )
             folder = Path(augmented)
             manifest = Manifest.read(folder)
@@ -328,13 +330,14 @@ class RecordedDetector:
             found = to_detections(result, calibration, self._rotation_y)
         return as_detections(place, found.boxes, found.scores, found.categories)
 
-    def _match(self, frames: FrameNames) -> Mapping[str, str]:
+    def _match(self, frames: FrameNames, *, only_these: bool) -> Mapping[str, str]:
         """Return the frame of each recorded name.
 
         Recorded frames that are not in the data set are reported by a warning.
 
         Raises:
-            DataError: if no recorded frame is in the data set, or a name fits several frames.
+            DataError: if no recorded frame is in the data set, a name fits several frames, or with
+                `only_these`, a recorded frame is not in the data set.
         """
         names = list(self._record.frame_ids())
         if not len(frames):
@@ -342,6 +345,11 @@ class RecordedDetector:
             return parts if len({*parts.values()}) == len(names) else {name: name for name in names}
         found, unmatched = frames.match(names, self.path)
         examples = ", ".join(unmatched[:3]) + (", ..." if len(unmatched) > 3 else "")
+        if unmatched and only_these:
+            raise DataError(
+                f"{self.path}: results for frames that were not requested ({examples}); the "
+                "detector must read the frames that it is given, not the whole data set"
+            )
         if unmatched and not found:
             raise DataError(
                 f"{self.path}: results for frames that do not exist ({examples})"

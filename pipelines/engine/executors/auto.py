@@ -20,7 +20,7 @@ from pipelines.engine.executors.base import (
     Job,
     JobFunction,
     Outcome,
-    is_exclusive,
+    allowed_workers,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
@@ -38,13 +38,11 @@ class AutoExecutor:
     """Processes frames in this process, or in worker processes when that saves time.
 
     Args:
-        workers: the most worker processes; None for one per usable core, and none for a model on
-            a GPU. The free memory may
+        workers: the most worker processes; None for one per usable core. The free memory may
             allow fewer: each worker needs about as much as this process with the model loaded.
     """
 
     def __init__(self, workers: int | None = None) -> None:
-        self._automatic = workers is None
         self._limit = usable_cores() if workers is None else workers
         self._pool: ProcessExecutor | None = None
 
@@ -59,7 +57,8 @@ class AutoExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        if self._limit == 1 or (self._automatic and is_exclusive(function)):
+        limit = allowed_workers(function, self._limit)
+        if limit == 1:
             yield from SerialExecutor().map(function, jobs)
             return
         packed = pickle.dumps(function)  # before the models are loaded into it
@@ -76,7 +75,7 @@ class AutoExecutor:
                 seconds.append(sum(result.seconds for result in results))
                 yield from outcomes_of(job, results)
             left = operator.length_hint(jobs, -1)
-            if self._saves_time(left, median(seconds[1:] or seconds), opening_s):
+            if self._saves_time(left, median(seconds[1:] or seconds), opening_s, limit):
                 workers = min(affordable_workers(self._limit), max(left, 0) or self._limit)
                 if workers > 1:
                     del here  # frees the memory of its models
@@ -88,12 +87,12 @@ class AutoExecutor:
         if self._pool:
             self._pool.close()
 
-    def _saves_time(self, left: int, job_s: float, opening_s: float) -> bool:
+    def _saves_time(self, left: int, job_s: float, opening_s: float, workers: int) -> bool:
         """Return whether the remaining jobs would end earlier with workers."""
         if left < 0:
             return True
         start_s = opening_s + (0.0 if self._pool else START_S)
-        return left * job_s > start_s + left * job_s / self._limit
+        return left * job_s > start_s + left * job_s / workers
 
     def _workers(self, workers: int) -> ProcessExecutor:
         """Return the pool; it lives until `close`, so that later stages find its workers."""

@@ -142,6 +142,11 @@ class BatchFunction(Protocol):
         """The most frames of a call. The rows do not depend on it."""
         ...
 
+    @property
+    def workers(self) -> int | None:
+        """The most workers that may run it at the same time; None for any number."""
+        ...
+
     def open(self) -> None:
         """Load the models and the data set; an error here ends the run."""
         ...
@@ -151,6 +156,27 @@ class BatchFunction(Protocol):
 
         If the call raises an error, it is repeated with smaller batches, so that only the frames
         fail that raise it by themselves.
+        """
+        ...
+
+
+@runtime_checkable
+class TrialFunction(BatchFunction, Protocol):
+    """A function whose every call may fail for the same reason, such as a command of the user.
+
+    The run ends if its first call, with a few frames, or several later ones in a row fail.
+    """
+
+    @property
+    def trial_size(self) -> int:
+        """How many frames the first call gets; 0 for no trial."""
+        ...
+
+    def trial(self, jobs: Sequence[FrameJob]) -> Sequence[FrameRows | CurateError]:
+        """Return what `batch` returns.
+
+        Raises:
+            CurateError: if later calls would fail as well; it ends the run.
         """
         ...
 
@@ -174,12 +200,22 @@ JobFunction = FrameFunction | BatchFunction | SequenceFunction
 
 
 @runtime_checkable
+class LimitedFunction(Protocol):
+    """A function that not all workers should run at the same time."""
+
+    @property
+    def workers(self) -> int | None:
+        """How many workers run it at the same time; None for all of them."""
+        ...
+
+
+@runtime_checkable
 class DeviceFunction(Protocol):
     """A function with a model that may run on a device which workers should not share: a GPU."""
 
     @property
     def exclusive(self) -> bool:
-        """Whether it does. Then one worker is started unless the user asks for more."""
+        """Whether it does."""
         ...
 
     def prefetch(self, jobs: Sequence[FrameJob]) -> None:
@@ -187,9 +223,10 @@ class DeviceFunction(Protocol):
         ...
 
 
-def is_exclusive(function: JobFunction) -> bool:
-    """Return whether workers should not share the device of a function's model."""
-    return isinstance(function, DeviceFunction) and function.exclusive
+def allowed_workers(function: JobFunction, workers: int) -> int:
+    """Return how many of the workers may run a function at the same time."""
+    limit = function.workers if isinstance(function, LimitedFunction) else None
+    return workers if limit is None else min(workers, limit)
 
 
 def reading_ahead(function: JobFunction, jobs: Iterable[Job]) -> Iterator[Job]:
@@ -224,12 +261,14 @@ class Outcome:
         rows: rows of each of its frames, in order; empty if it failed.
         error: error message in one line; None if it succeeded.
         seconds: time that it took; for a frame of a batch, its share.
+        ends_job: false if other outcomes of the same batch follow at once.
     """
 
     job: Part
     rows: Sequence[FrameRows]
     error: str | None
     seconds: float
+    ends_job: bool = True
 
 
 class Executor(Protocol):
@@ -365,8 +404,9 @@ class Result(NamedTuple):
 
 def outcomes_of(job: Job, results: Sequence[Result]) -> Iterator[Outcome]:
     """Yield the outcomes of the parts of a job."""
+    last = job.parts[-1]
     for part, result in zip(job.parts, results, strict=True):
-        yield Outcome(part, *result)
+        yield Outcome(part, *result, ends_job=part is last)
 
 
 def attempt(function: Any, job: Job) -> list[Result]:
@@ -384,11 +424,31 @@ def attempt(function: Any, job: Job) -> list[Result]:
         if isinstance(job, BatchJob) and (halves := job.halves()):
             return [result for half in halves for result in attempt(function, half)]
         found = [error]
-    seconds = (time.perf_counter() - start) / len(job.parts)
+    return _results(job, found, time.perf_counter() - start)
+
+
+def attempt_trial(function: TrialFunction, job: BatchJob) -> list[Result]:
+    """Run the first job of a function and return the results of its frames.
+
+    Raises:
+        CurateError: if later jobs would fail as well.
+    """
+    start = time.perf_counter()
+    open_function(function)
+    found = [
+        rows if isinstance(rows, CurateError) else (rows,) for rows in function.trial(job.frames)
+    ]
+    return _results(job, found, time.perf_counter() - start)
+
+
+def _results(
+    job: Job, found: Sequence[Sequence[FrameRows] | Exception], seconds: float
+) -> list[Result]:
+    share = seconds / len(job.parts)
     return [
-        Result((), _message(part, each), seconds)
+        Result((), _message(part, each), share)
         if isinstance(each, Exception)
-        else Result(each, None, seconds)
+        else Result(each, None, share)
         for part, each in zip(job.parts, found, strict=True)
     ]
 

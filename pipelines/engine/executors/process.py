@@ -24,7 +24,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
-    is_exclusive,
+    allowed_workers,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
@@ -38,13 +38,11 @@ class ProcessExecutor:
     """Processes frames in spawned processes, which live until `close`.
 
     Args:
-        workers: number of processes; None for one per usable core, and one for a model on a GPU.
+        workers: number of processes; None for one per usable core.
     """
 
     def __init__(self, workers: int | None = None) -> None:
-        self._automatic = workers is None
         self.workers = usable_cores() if workers is None else workers
-        self._limit = self.workers
         self._workers: list[_Worker] = []
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
@@ -53,12 +51,12 @@ class ProcessExecutor:
         Raises:
             CurateError: if the models cannot be loaded, or workers crash while they load them.
         """
-        self._limit = 1 if self._automatic and is_exclusive(function) else self.workers
-        queue = JobQueue(jobs, self._limit)
+        workers = allowed_workers(function, self.workers)
+        queue = JobQueue(jobs, workers)
         packed = pickle.dumps(function)
         try:
             while True:
-                self._dispatch(packed, queue)
+                self._dispatch(packed, queue, workers)
                 busy = {worker.connection: worker for worker in self._workers if worker.in_flight}
                 if not busy:
                     return
@@ -78,11 +76,11 @@ class ProcessExecutor:
             worker.process.join(POLL_S)
             self._dismiss(worker)
 
-    def _dispatch(self, packed: bytes, queue: JobQueue) -> None:
+    def _dispatch(self, packed: bytes, queue: JobQueue, workers: int) -> None:
         while (job := queue.take()) is not None:
-            used = self._workers[: self._limit]
-            idle = min(used, key=lambda worker: len(worker.in_flight), default=None)
-            if len(used) < self._limit and (idle is None or idle.in_flight):
+            crew = self._workers[:workers]
+            idle = min(crew, key=lambda worker: len(worker.in_flight), default=None)
+            if len(crew) < workers and (idle is None or idle.in_flight):
                 self._workers.append(idle := _Worker())
             if idle is None or len(idle.in_flight) == JOBS_PER_WORKER:
                 queue.return_jobs([job])

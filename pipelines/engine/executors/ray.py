@@ -20,6 +20,7 @@ from pipelines.engine.executors.base import (
     JobFunction,
     JobQueue,
     Outcome,
+    allowed_workers,
     outcomes_of,
 )
 from pipelines.engine.executors.machine import usable_cores
@@ -75,11 +76,12 @@ class RayExecutor:
             CurateError: if the models cannot be loaded, actors crash while they load them, or the
                 cluster has no resources for a single actor.
         """
-        queue = JobQueue(jobs, self.workers)
+        workers = allowed_workers(function, self.workers)
+        queue = JobQueue(jobs, workers)
         packed = pickle.dumps(function)
         placed_at = time.monotonic()
         try:
-            while self._dispatch(packed, queue):
+            while self._dispatch(packed, queue, workers):
                 heads = {actor.head(): actor for actor in self._actors if actor.results}
                 ready, _ = self._ray.wait(list(heads), num_returns=1, timeout=POLL_S)
                 for ref in ready:
@@ -106,18 +108,15 @@ class RayExecutor:
         if self._owns_cluster:
             self._ray.shutdown()
 
-    def _dispatch(self, packed: bytes, queue: JobQueue) -> bool:
+    def _dispatch(self, packed: bytes, queue: JobQueue, workers: int) -> bool:
         """Send jobs to the actors that have loaded their models; return whether any are left."""
         while (job := queue.take()) is not None:
-            while len(self._actors) < self.workers:
+            while len(self._actors) < workers:
                 self._actors.append(_Actor(self._actor_class.remote(sys.path)))
-            for actor in self._actors:
+            crew = self._actors[:workers]
+            for actor in crew:
                 actor.open(packed)
-            free = [
-                actor
-                for actor in self._actors
-                if actor.opened and len(actor.jobs) < JOBS_PER_WORKER
-            ]
+            free = [actor for actor in crew if actor.opened and len(actor.jobs) < JOBS_PER_WORKER]
             if not free:
                 queue.return_jobs([job])
                 return True

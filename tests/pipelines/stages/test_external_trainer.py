@@ -12,7 +12,6 @@ from support.rounds import run_stage, run_workspace
 
 from curate.errors import ConfigError, TrainerFailed, WorkspaceError
 from pipelines.engine.rounds import find_teacher
-from pipelines.stages.external_trainer import split_command
 from pipelines.workspace.workspace import Workspace
 
 TRAINER = """
@@ -242,11 +241,3 @@ def test_an_invalid_command_is_rejected(
     assert ended == ConfigError.exit_code
     assert message in err
     assert err.count("\n") == 1
-
-
-def test_the_command_is_not_run_by_a_shell() -> None:
-    """Special characters stay text, and values stay within their argument."""
-    values = {"labels": "/my data/{round}; rm -rf", "round": "1"}
-    assert split_command("t --in={labels} '{other}' $HOME && {round", values) == [
-        "t", "--in=/my data/{round}; rm -rf", "{other}", "$HOME", "&&", "{round",
-    ]  # fmt: skip

@@ -30,18 +30,17 @@ def test_the_next_frame_is_read_while_the_device_computes():
 
 
 def test_auto_starts_no_worker_for_a_gpu(monkeypatch):
-    """Even if it would save time on the CPU; a number of workers from the user counts."""
+    """Even if it would save time on the CPU."""
     monkeypatch.setattr(AutoExecutor, "_saves_time", lambda *_: True)
-    monkeypatch.setattr("pipelines.engine.executors.auto.usable_cores", lambda: 2)
-    assert {process for process, _ in rows(AutoExecutor(), OnDevice())} == {os.getpid()}
+    assert {process for process, _ in rows(AutoExecutor(2), OnDevice())} == {os.getpid()}
     monkeypatch.setattr("pipelines.engine.executors.auto.MEASURED_JOBS", 1)
-    assert {process for process, _ in rows(AutoExecutor(2), OnDevice())} != {os.getpid()}
+    assert {process for process, _ in rows(AutoExecutor(2), OnDevice(workers=2))} != {os.getpid()}
 
 
-@pytest.mark.parametrize(("workers", "expected"), [(None, 1), (2, 2)])
-def test_worker_processes_share_a_gpu_only_on_request(monkeypatch, workers, expected):
-    """One by default, even where an earlier stage has started more."""
-    monkeypatch.setattr("pipelines.engine.executors.process.usable_cores", lambda: 2)
-    executor = ProcessExecutor(workers)
-    list(executor.map(OnDevice(exclusive=False), JOBS))
-    assert len({process for process, _ in rows(executor, OnDevice())}) == expected
+@pytest.mark.parametrize("workers", [1, 2])
+def test_worker_processes_share_a_gpu_only_on_request(workers):
+    """Even where an earlier stage has started more of them."""
+    executor = ProcessExecutor(2)
+    list(executor.map(OnDevice(exclusive=False, workers=None), JOBS))
+    found = rows(executor, OnDevice(workers=workers))
+    assert len({process for process, _ in found}) == workers
