@@ -32,7 +32,7 @@ from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
 
@@ -49,7 +49,7 @@ _MAX_CROPPED_PIXELS = 4 * MAX_PIXELS  # of all crops of an image
 _MAX_ASPECT_ERROR = 1.25
 
 
-class OnnxSegmenter:
+class OnnxSegmenter(Segmenter):
     """A `Segmenter` that runs an ONNX model on the CPU.
 
     Args:
@@ -73,6 +73,7 @@ class OnnxSegmenter:
 
     needs_image = True
     needs_points = False
+    map_version = 1
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from curate.errors import ConfigError, ModelError
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
 from curate.segmenters.onnx_outputs import KINDS, Instance
@@ -26,7 +26,7 @@ _OUTPUTS = {name: name for name in ("boxes", "labels", "scores", "masks")}
 _GREY = 114
 
 
-class OnnxInstanceSegmenter:
+class OnnxInstanceSegmenter(Segmenter):
     """A `Segmenter` that runs an ONNX model of instance segmentation on the CPU.
 
     Args:
@@ -48,6 +48,7 @@ class OnnxInstanceSegmenter:
 
     needs_image = True
     needs_points = False
+    map_version = 1
 
     def __init__(
         self,

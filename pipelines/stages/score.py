@@ -131,8 +131,13 @@ class ScoreSequence:
         ]
 
 
-def stage(source: Source) -> FramesStage:
-    """Return the stage of a source."""
+def stage(source: Source, maps: Sequence[str] = ()) -> FramesStage:
+    """Return the stage of a source.
+
+    Args:
+        source: the source.
+        maps: what a source with a segmenter reads besides: the stored maps, if there are any.
+    """
     name = source.configured
     if source.of_sequences:
         return SequenceStage(
@@ -145,10 +150,11 @@ def stage(source: Source) -> FramesStage:
             prepare=partial(prepare_stage, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
+    shown = tuple(maps) if PRIORS.takes(name, "segmenter") else ()
     return FrameStage(
         name,
         command=f"score --prior {name}",
-        reads=("frame", *learns, "prediction"),
+        reads=("frame", *learns, *shown, "prediction"),
         writes=(source.table,),
         settings=partial(_settings, source),
         function=partial(_function, Score, name),
@@ -163,13 +169,22 @@ def stage(source: Source) -> FramesStage:
     )
 
 
-def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
+def stages(names: Sequence[str], maps: Sequence[str] = ()) -> tuple[FramesStage, ...]:
     """Return the stages of several sources.
+
+    Args:
+        names: names of the sources.
+        maps: see `stage`.
 
     Raises:
         ConfigError: if one is unknown or invalid, or two share a name or a column.
     """
-    return tuple(map(stage, sources_of(names)))
+    return tuple(stage(source, maps) for source in sources_of(names))
+
+
+def reads_maps(names: Sequence[str]) -> bool:
+    """Return whether one of the sources has a segmenter."""
+    return any(PRIORS.takes(name, "segmenter") for name in names)
 
 
 def _check(name: str, workspace: Workspace) -> None:
@@ -209,7 +224,7 @@ def _measured_settings(source: Source, workspace: Workspace, _context: RoundCont
     if not PRIORS.takes(name, "segmenter"):
         return options
     path = segmenter_path(config)
-    exclude = {"path", *unset_rename(config.segmenter)}
+    exclude = {"path", "cache", "cache_limit", *unset_rename(config.segmenter)}
     segmenter = config.segmenter.model_dump(mode="json", exclude=exclude)
     return {**options, "segmenter": segmenter, "model": _identity(path)}
 

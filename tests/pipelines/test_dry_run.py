@@ -52,7 +52,10 @@ def contents(root: Path) -> tuple[list[str], dict[Path, bytes]]:
 
 def test_every_stage_command_has_the_option() -> None:
     """Every stage is listed."""
-    stages = {"pretrain", "predict", "repredict", "score", "solve", "export", "train-round", "run"}
+    stages = {
+        "pretrain", "segment", "predict", "repredict", "score", "solve", "export", "train-round",
+        "run",
+    }  # fmt: skip
     assert with_option("--dry-run") == stages | {"review import"}
 
 
