@@ -56,7 +56,7 @@ def test_every_stage_command_has_the_option() -> None:
         "pretrain", "segment", "predict", "repredict", "score", "solve", "export", "train-round",
         "run",
     }  # fmt: skip
-    assert with_option("--dry-run") == stages | {"review import"}
+    assert with_option("--dry-run") == stages | {"augment", "review import"}
 
 
 def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None:
