@@ -14,7 +14,7 @@ from curate.errors import ConfigError, DatabaseError, LeakageError, joined_lines
 from db import bulk
 from db.addresses import parse_url
 from db.backups import back_up
-from db.claims import Check, claimed, round_resources, wait_for_transactions
+from db.claims import Check, Resource, claimed, round_resources, wait_for_transactions
 from db.lock_holders import find_writers
 from db.models import Base
 from db.read_only import is_read_only, read_only_uri
@@ -104,7 +104,16 @@ class Database:
         Raises:
             DatabaseError: if another process works on it; the message says which one.
         """
-        resources = round_resources(number, policy)
+        with self.claiming(round_resources(number, policy), purpose):
+            yield
+
+    @contextmanager
+    def claiming(self, resources: Sequence[Resource], purpose: str) -> Iterator[None]:
+        """Claim resources until the block ends; see `db.claims`.
+
+        Raises:
+            DatabaseError: if another process holds one of them; the message says which one.
+        """
         with ExitStack() as stack:
             with self._translate_errors():
                 check = stack.enter_context(claimed(self.engine, resources, purpose))

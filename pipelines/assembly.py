@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
+from glob import escape
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,6 +31,7 @@ from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import DeclaresClasses, Segmenter
+from curate.segmenters.map_store import MapStore, StoringSegmenter
 from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
 from curate.weighting.base import Policy
 from pipelines import registry
@@ -40,7 +42,7 @@ from pipelines.devices import (
     detector_place,
 )
 from pipelines.workspace.config import Config
-from pipelines.workspace.workspace import open_dataset
+from pipelines.workspace.workspace import open_dataset, sha256
 
 Kind = TypeVar("Kind")
 
@@ -220,7 +222,7 @@ def _calibrations(config: Config) -> Callable[[str], Calibration]:
 
 
 def open_segmenter(config: Config) -> Segmenter:
-    """Return the segmenter.
+    """Return the segmenter; it reads and writes the stored maps if its maps can be stored.
 
     Raises:
         ConfigError: if no segmenter is configured, or a setting is missing or wrong.
@@ -233,15 +235,11 @@ def open_segmenter(config: Config) -> Segmenter:
             f"segmenter '{section.name}' needs a path: set segmenter.path in curate.toml, or leave "
             "'semantic' out of run.priors"
         )
-    name, classes = section.name, section.classes
-    if name == "simulated":
-        name, classes = "onnx", "simulated"
     segmenter: Segmenter = registry.SEGMENTERS.build(
-        name,
+        _segmenter_name(config),
         path,
         offered={
-            "classes": lambda: _class_map(name, classes),
-            "seed": lambda: config.run.seed,
+            **_segmenter_arguments(config),
             "frame_ids": lambda: FrameNames.of_dataset(open_dataset(config)),
             "providers": lambda: section.providers,
             "provider_options": lambda: section.provider_options,
@@ -250,7 +248,79 @@ def open_segmenter(config: Config) -> Segmenter:
     )
     if isinstance(segmenter, DeclaresClasses):
         _check_classes(config, segmenter.classes)
+    if stores_maps(config):
+        segmenter = StoringSegmenter(segmenter, open_map_store(config), open_dataset(config))
     return RenamedSegmenter(segmenter, section.rename) if section.rename else segmenter
+
+
+def why_maps_are_not_stored(config: Config) -> str:
+    """Return why the maps of the configured segmenter are not stored; "" if they are."""
+    section, name = config.segmenter, _segmenter_name(config)
+    if name == "none":
+        return "segmenter.name is 'none'"
+    if section.cache is None or section.cache_limit == 0:
+        return "segmenter.cache_limit is 0"
+    if registry.SEGMENTERS.declared(name, "map_version") is None:
+        return (
+            f"the maps of segmenter '{name}' are not stored: they are files already, or depend on "
+            "more than the image (its class declares no map_version)"
+        )
+    return ""
+
+
+def stores_maps(config: Config) -> bool:
+    """Return whether the maps of the configured segmenter are stored."""
+    return not why_maps_are_not_stored(config)
+
+
+def open_map_store(config: Config) -> MapStore:
+    """Return the folder of the stored maps of the configured segmenter."""
+    section = config.segmenter
+    root = section.cache or Path("maps")
+    return MapStore(root, made_by(config), limit_gib=section.cache_limit)
+
+
+def made_by(config: Config) -> dict[str, Any]:
+    """Return everything besides the image that the maps of the configured segmenter depend on.
+
+    Names of categories that are changed by `segmenter.rename` and the place of the model are not
+    part of it.
+    """
+    name, path = _segmenter_name(config), segmenter_path(config)
+    arguments = registry.SEGMENTERS.arguments(
+        name,
+        path,
+        offered=_segmenter_arguments(config),
+        options=config.segmenter.options,
+    )
+    return {
+        "segmenter": registry.SEGMENTERS.classes.get(name, name),
+        "map_version": registry.SEGMENTERS.declared(name, "map_version"),
+        "arguments": arguments,
+        "model": [sha256(file) for file in _model_files(path)],
+    }
+
+
+def _model_files(path: Path | None) -> list[Path]:
+    """Return a model's file or folder, with the files of its weights, such as model.onnx.data."""
+    if path is None or not path.is_file():
+        return [path] if path and path.exists() else []
+    return sorted(each for each in path.parent.glob(f"{escape(path.name)}*") if each.is_file())
+
+
+def _segmenter_name(config: Config) -> str:
+    """Return the registered name, or the class, of the configured segmenter."""
+    return "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
+
+
+def _segmenter_arguments(config: Config) -> Mapping[str, Callable[[], Any]]:
+    """Return functions for the arguments besides the options that decide how maps are made."""
+    section = config.segmenter
+    classes = "simulated" if section.name == "simulated" else section.classes
+    return {
+        "classes": lambda: _class_map(section.name, classes),
+        "seed": lambda: config.run.seed,
+    }
 
 
 def check_segmenter_names(config: Config) -> None:
@@ -296,7 +366,7 @@ def check_segmenter(config: Config) -> None:
     Raises:
         ConfigError: if it cannot be imported or does not accept its options.
     """
-    name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
+    name = _segmenter_name(config)
     if name != "none":
         with error_prefix("segmenter.name"):
             registry.SEGMENTERS.check(

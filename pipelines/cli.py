@@ -32,6 +32,7 @@ from pipelines.commands.repredict import repredict
 from pipelines.commands.review import group as review
 from pipelines.commands.run import run
 from pipelines.commands.score import score
+from pipelines.commands.segment import segment
 from pipelines.commands.serve import serve
 from pipelines.commands.simulate import simulate
 from pipelines.commands.solve import solve
@@ -41,7 +42,18 @@ from pipelines.commands.view import view
 
 GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
     "Set up": (simulate, demo, init, doctor, check, status, graph),
-    "Stages": (pretrain, predict, augment, repredict, score, solve, export, train_round, run),
+    "Stages": (
+        pretrain,
+        segment,
+        predict,
+        augment,
+        repredict,
+        score,
+        solve,
+        export,
+        train_round,
+        run,
+    ),
     "Look and ask": (query, explain, view, report, diff, serve, review),
     "Measure": (evaluate, audit, bench),
 }

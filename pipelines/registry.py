@@ -82,6 +82,25 @@ class Registry:
             )
         return loaded
 
+    def declared(self, name: str, member: str) -> Any:
+        """Return a class attribute of a class, or else the default in the protocol."""
+        module_name, _, protocol = self.protocol.partition(":")
+        default = getattr(getattr(importlib.import_module(module_name), protocol), member)
+        return getattr(self.load(name), member, default)
+
+    def arguments(
+        self,
+        name: str,
+        *given: Any,
+        offered: Mapping[str, Callable[[], Any]],
+        options: Mapping[str, Any],
+    ) -> dict[str, Any]:
+        """Return the keyword arguments with which `build` calls a class, with its defaults."""
+        factory = self.check(name, *given, offered=offered.keys(), options=options)
+        bound = inspect.signature(factory).bind(*given, **_keywords(factory, offered, options))
+        bound.apply_defaults()
+        return dict(list(bound.arguments.items())[len(given) :])
+
     def takes(self, name: str, argument: str) -> bool:
         """Return whether the constructor of a class has the argument."""
         return argument in inspect.signature(self.load(name)).parameters
@@ -139,10 +158,9 @@ class Registry:
                 `CurateError`, which is passed on unchanged.
         """
         factory = self.check(name, *given, offered=offered.keys(), options=options)
-        accepted = inspect.signature(factory).parameters.keys() - options.keys()
-        keywords = {key: make() for key, make in offered.items() if key in accepted}
+        keywords = _keywords(factory, offered, options)
         try:
-            return factory(*given, **keywords, **options)
+            return factory(*given, **keywords)
         except CurateError:
             raise
         except Exception as error:  # a user's class may raise anything
@@ -268,6 +286,16 @@ def trainable(name: str) -> "type[TrainableDetector] | None":
 def trainable_names() -> list[str]:
     """Return the names of the registered detectors that curate can train."""
     return [name for name in DETECTORS.classes if trainable(name)]
+
+
+def _keywords(
+    factory: Callable[..., Any],
+    offered: Mapping[str, Callable[[], Any]],
+    options: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the keyword arguments of a constructor: those offered that it has, and the options."""
+    accepted = inspect.signature(factory).parameters.keys() - options.keys()
+    return {**{key: make() for key, make in offered.items() if key in accepted}, **options}
 
 
 def _import_hint(error: Exception, module: str) -> str:

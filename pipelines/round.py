@@ -3,11 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pipelines.assembly import stores_maps
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import is_pretrained, open_round
-from pipelines.engine.stage import FirstStage, FrameStage, RoundStage, Stage
-from pipelines.stages import export, predict, pretrain, repredict, score, solve, train_round
+from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
+from pipelines.stages import (
+    export,
+    predict,
+    pretrain,
+    repredict,
+    score,
+    segment,
+    solve,
+    train_round,
+)
 from pipelines.stages.copies import check_copies
 from pipelines.workspace.config import DEFAULT_PRIORS
 from pipelines.workspace.workspace import Workspace
@@ -22,6 +32,18 @@ _FIRST = (
         run=pretrain.run,
         file=pretrain.file,
         guard=pretrain.guard,
+    ),
+)
+_SEGMENT = (
+    CacheStage(
+        "segment",
+        command="segment",
+        reads=("frame",),
+        writes=("maps",),
+        settings=segment.settings,
+        function=segment.function,
+        check=segment.check,
+        refusal=segment.refusal,
     ),
 )
 _DETECT = (
@@ -81,27 +103,35 @@ _DECIDE = (
 )
 
 
-def round_graph(priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = True) -> Graph:
+def round_graph(
+    priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = True, maps: bool = True
+) -> Graph:
     """Return the graph of a round.
 
     Args:
         priors: names of the evidence sources, as in run.priors.
         pretrained: whether curate trains the first teacher, so that the graph starts with pretrain.
+        maps: whether the segmenter's maps are stored, so that segment makes them ahead.
 
     Raises:
         ConfigError: if there is no such prior, or its declaration is invalid.
     """
     first: tuple[Stage, ...] = _FIRST if pretrained else ()
-    scores = score.stages(priors)
+    ahead = _SEGMENT if maps and score.reads_maps(priors) else ()
+    scores = score.stages(priors, [each for stage in ahead for each in stage.writes])
     evidence = tuple(table for stage in scores for table in stage.writes)
     solve_stage, *others = _DECIDE
     waiting = replace(solve_stage, reads=(*solve_stage.reads, *evidence))
-    return Graph((*first, *_DETECT, *scores, waiting, *others))
+    return Graph((*first, *ahead, *_DETECT, *scores, waiting, *others))
 
 
 def graph_of(workspace: Workspace) -> Graph:
     """Return the graph of a workspace, see `round_graph`."""
-    return round_graph(workspace.config.run.priors, pretrained=is_pretrained(workspace))
+    return round_graph(
+        workspace.config.run.priors,
+        pretrained=is_pretrained(workspace),
+        maps=stores_maps(workspace.config),
+    )
 
 
 def open_plan(workspace: Workspace, number: int | None = None, rounds: int | None = None) -> Plan:

@@ -1,6 +1,7 @@
 """Atomic writes: a file is written under a temporary name in the same folder, then renamed."""
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,9 +10,10 @@ from pathlib import Path
 def replace_file(path: Path, content: bytes) -> None:
     """Write `content` to `path` atomically: a reader never sees part of it, even after a kill.
 
-    Missing parent folders are created. An existing file is replaced.
+    Missing parent folders are created. An existing file is replaced. Several processes, also of
+    several machines with one disk, may write the same file at once: the last one stays.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     try:
         try:
             partial.write_bytes(content)

@@ -42,11 +42,20 @@ class Segmenter(Protocol):
     A frame to segment has one camera: of a frame with several, each is segmented by itself, with
     the name of the camera in `frame.camera`.
 
-    A segmenter that never reads `frame.points` may define a further attribute `needs_points` =
-    False. Then the points are not loaded for it.
+    The attributes with a default may be left out.
+
+    Attributes:
+        needs_image: whether it reads `frame.image`.
+        needs_points: whether it reads `frame.points`; otherwise they are not loaded for it.
+        map_version: a number if the map depends on nothing but the pixels and the arguments of the
+            constructor (a model's file by its content). The pipeline then makes the map of an image
+            once and stores it, see `curate.segmenters.map_store`. Raise the number when the class
+            makes other maps than before. None: the map is made whenever it is needed.
     """
 
-    needs_image: bool
+    needs_image: bool = True
+    needs_points: bool = True
+    map_version: int | None = None
 
     def segment(self, frame: Frame) -> SemanticMap:
         """Return the frame's semantic map, of the same size as its image."""

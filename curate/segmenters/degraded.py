@@ -26,7 +26,7 @@ import numpy as np
 from curate.errors import ConfigError
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import class_map
 from curate.segmenters.saved import SavedSegmenter
 
@@ -70,7 +70,7 @@ class ErrorModel:
                 raise ConfigError(f"degraded segmenter: {name} is {value}, expected an integer")
 
 
-class DegradedSegmenter:
+class DegradedSegmenter(Segmenter):
     """A `Segmenter` that reads the maps of a simulated data set and degrades them.
 
     Args:

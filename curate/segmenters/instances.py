@@ -16,14 +16,14 @@ from curate.errors import ConfigError, DataError
 from curate.files.json_text import read_json
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap, image_size_of
+from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.masks import decode_mask
 
 Objects = Sequence[Mapping[str, Any]]
 
 
-class InstanceSegmenter:
+class InstanceSegmenter(Segmenter):
     """A `Segmenter` that reads instance masks from JSON.
 
     Args:
@@ -42,6 +42,7 @@ class InstanceSegmenter:
     """
 
     needs_image = False
+    needs_points = False
 
     def __init__(
         self,

@@ -14,7 +14,8 @@ width. Two rules decide where crops overlap:
    class of the other crop.
 
 DeepLab v3 on 45 cars in 24 KITTI frames labels this share of the pixels in their 2D boxes as car:
-0.17 with the whole image, 0.59 with rule 1, 0.62 with both rules.
+0.17 with the whole image, 0.59 with rule 1, 0.62 with both rules (five crops). As many crops as
+cover the image are used unless more are configured: docs/segmenters.md has the measurements.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +33,7 @@ from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
 
@@ -49,14 +50,15 @@ _MAX_CROPPED_PIXELS = 4 * MAX_PIXELS  # of all crops of an image
 _MAX_ASPECT_ERROR = 1.25
 
 
-class OnnxSegmenter:
+class OnnxSegmenter(Segmenter):
     """A `Segmenter` that runs an ONNX model.
 
     Args:
         model: the .onnx file.
         classes: the class ids that count for each category.
         tiles: number of crops for an image that is too wide for the model's input; more are used if
-            that many do not cover the image. 1: the whole image is always squeezed.
+            that many do not cover the image. None: as many as cover it. 1: the whole image is
+            always squeezed.
         scaling: how pixels are scaled for a float model: "imagenet" (mean 0, standard deviation 1),
             "unit" (0 to 1) or "none" (0 to 255).
         output: name of the output with the map; not needed if there is one.
@@ -75,13 +77,14 @@ class OnnxSegmenter:
 
     needs_image = True
     needs_points = False
+    map_version = 1
 
     def __init__(
         self,
         model: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
-        tiles: int = 5,
+        tiles: int | None = None,
         scaling: str = "imagenet",
         output: str | None = None,
         channels: str | None = None,
@@ -89,7 +92,7 @@ class OnnxSegmenter:
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
     ) -> None:
-        if tiles < 1:
+        if tiles is not None and tiles < 1:
             raise ConfigError(f"segmenter.options.tiles {tiles}: expected at least 1")
         if channels not in {None, *_LAYOUTS}:
             raise ConfigError(f"segmenter.options.channels {channels!r}: use first or last")
@@ -108,7 +111,7 @@ class OnnxSegmenter:
         image = image_of(frame)
         height, width = image.shape[:2]
         crops = self._crops(width, height)
-        tiles = [self._run(image[:, crop.left : crop.right]) for crop in crops]
+        tiles = self._run([image[:, crop.left : crop.right] for crop in crops])
         return SemanticMap(self._merge(crops, tiles), self.classes)
 
     def _merge(self, crops: list["Crop"], tiles: list[np.ndarray]) -> np.ndarray:
@@ -137,7 +140,7 @@ class OnnxSegmenter:
         if squeeze <= _SQUEEZE_LIMIT:
             return whole
         crop_width = max(round(width / squeeze), 1)
-        count = max(self.tiles, ceil(width / crop_width))
+        count = max(self.tiles or 1, ceil(width / crop_width))
         if count * shape.width * shape.height > _MAX_CROPPED_PIXELS:
             raise ModelError(
                 f"{self._model.path}: takes images of {shape.width} x {shape.height} pixels, so an "
@@ -145,20 +148,20 @@ class OnnxSegmenter:
             )
         return cut_along(width, crop_width, count)
 
-    def _run(self, image: np.ndarray) -> np.ndarray:
-        """Return the (h, w) uint8 class ids of an (h, w, 3) image."""
-        height, width = image.shape[:2]
+    def _run(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the (h, w) uint8 class ids of (h, w, 3) images of one size."""
+        height, width = images[0].shape[:2]
         shape = self._model.input
         target = (shape.width or width, shape.height or height)
         shrinks = target[0] < width or target[1] < height
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        pixels = cv2.resize(image, target, interpolation=interpolation)
-        output = self._model.run(pixels, [self._output])[self._output]
+        pixels = [cv2.resize(image, target, interpolation=interpolation) for image in images]
+        outputs = self._model.run_all(pixels, self._output)
         try:
-            class_ids = _class_ids(output, target, self._channels)
+            maps = [_class_ids(output, target, self._channels) for output in outputs]
         except ModelError as error:
             raise ModelError(f"{self._model.path}: {error}") from None
-        return cv2.resize(class_ids, (width, height), interpolation=cv2.INTER_NEAREST)
+        return [cv2.resize(each, (width, height), interpolation=cv2.INTER_NEAREST) for each in maps]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from curate.datasets.formats.images import MAX_PIXELS
 from curate.errors import ConfigError, ModelError
 from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
-from curate.files.onnx_session import ModelValue, OnnxModel
+from curate.files.onnx_session import ModelValue, OnnxModel, is_numeric_array
 from curate.frames import Frame
 
 # Mean and standard deviation of ImageNet's RGB, as used to train most published models.
@@ -44,7 +44,8 @@ class ImageInput:
         kind: numpy type of the values: uint8, float16, float32 or float64.
         channels_first: whether the axes are channels, height, width; otherwise the channels are
             last.
-        batched: whether there is a leading batch axis of length 1.
+        batched: whether there is a leading batch axis.
+        several: whether the batch axis may be longer than 1.
         height: height in pixels; None if any height is accepted.
         width: width in pixels; None if any width is accepted.
     """
@@ -53,17 +54,25 @@ class ImageInput:
     kind: type
     channels_first: bool
     batched: bool
+    several: bool
     height: int | None
     width: int | None
 
-    def feed(self, pixels: np.ndarray, scaling: str) -> dict[str, np.ndarray]:
-        """Return the session's inputs for (height, width, 3) uint8 RGB pixels of the input size."""
-        if self.kind is not np.uint8:
-            mean, deviation = SCALINGS[scaling]
-            pixels = ((pixels - mean) / deviation).astype(self.kind)
+    def feed(self, images: Sequence[np.ndarray], scaling: str) -> dict[str, np.ndarray]:
+        """Return the session's inputs for (height, width, 3) uint8 RGB images of the input size.
+
+        Several images need an input that takes several.
+        """
+        mean, deviation = SCALINGS[scaling]
+        pixels = np.stack(
+            [
+                image if self.kind is np.uint8 else ((image - mean) / deviation).astype(self.kind)
+                for image in images
+            ]
+        )
         if self.channels_first:
-            pixels = pixels.transpose(2, 0, 1)
-        return {self.name: np.ascontiguousarray(pixels[None] if self.batched else pixels)}
+            pixels = pixels.transpose(0, 3, 1, 2)
+        return {self.name: np.ascontiguousarray(pixels if self.batched else pixels[0])}
 
 
 class ImageModel:
@@ -104,6 +113,7 @@ class ImageModel:
         self._scaling = scaling
         self._model = OnnxModel(self.path, threads, "segmenter", providers, provider_options)
         self.input = _image_input(self._model.inputs, self.path, single=single)
+        self._takes_several = self.input.several
         self.outputs = self._model.outputs
 
     def run(self, pixels: np.ndarray, outputs: Sequence[str]) -> dict[str, Any]:
@@ -112,7 +122,26 @@ class ImageModel:
         Raises:
             ModelError: if the model fails.
         """
-        return self._model.run(self.input.feed(pixels, self._scaling), outputs)
+        return self._model.run(self.input.feed([pixels], self._scaling), outputs)
+
+    def run_all(self, images: Sequence[np.ndarray], output: str) -> list[np.ndarray]:
+        """Return an output for each of several images of the input size, with a batch axis of 1.
+
+        They go through the model as one batch if it takes one, else one after the other.
+
+        Raises:
+            ModelError: if the model fails.
+        """
+        if len(images) > 1 and self._takes_several:
+            try:
+                values = self._model.run(self.input.feed(images, self._scaling), [output])[output]
+            except ModelError:  # a free axis is declared, but another part of the model is fixed
+                self._takes_several = False
+            else:
+                if is_numeric_array(values) and len(values) == len(images):
+                    return [values[i : i + 1] for i in range(len(images))]
+                self._takes_several = False
+        return [self.run(image, [output])[output] for image in images]
 
 
 def image_of(frame: Frame) -> np.ndarray:
@@ -152,4 +181,5 @@ def _image_input(inputs: Sequence[ModelValue], model: Path, *, single: bool) -> 
         # Each frame would be enlarged to that size.
         raise ModelError(f"{model}: takes {shown}; expected an image of 1 to {MAX_PIXELS} pixels")
     kind = _TYPES[image.type]
-    return ImageInput(image.name, kind, channels_first, batched, height, width)
+    several = batched and batch is None
+    return ImageInput(image.name, kind, channels_first, batched, several, height, width)

@@ -17,7 +17,7 @@ from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap
+from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.onnx_images import ImageModel, image_of
 from curate.segmenters.onnx_outputs import KINDS, Instance
@@ -27,7 +27,7 @@ _OUTPUTS = {name: name for name in ("boxes", "labels", "scores", "masks")}
 _GREY = 114
 
 
-class OnnxInstanceSegmenter:
+class OnnxInstanceSegmenter(Segmenter):
     """A `Segmenter` that runs an ONNX model of instance segmentation.
 
     Args:
@@ -52,6 +52,7 @@ class OnnxInstanceSegmenter:
 
     needs_image = True
     needs_points = False
+    map_version = 1
 
     def __init__(
         self,

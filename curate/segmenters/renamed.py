@@ -7,7 +7,7 @@ from curate.frames import Frame
 from curate.segmenters.base import Segmenter, SemanticMap
 
 
-class RenamedSegmenter:
+class RenamedSegmenter(Segmenter):
     """A `Segmenter` with renamed categories; its maps stay the same.
 
     Args:

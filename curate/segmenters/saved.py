@@ -10,7 +10,7 @@ from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
-from curate.segmenters.base import SemanticMap, image_size_of
+from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.segmenters.classes import CLASS_MAPS, checked_classes, describe_unexpected_ids
 from curate.segmenters.colours import COLOUR_TABLES, colour_table, ids_of_colours
 from curate.segmenters.map_files import MapFile, read_map
@@ -24,7 +24,7 @@ _CHANNELS = ("red", "green", "blue")
 _BELOW = {1000: "class", 256: "instance"}
 
 
-class SavedSegmenter:
+class SavedSegmenter(Segmenter):
     """A `Segmenter` that reads DIRECTORY/FRAME.png or FRAME.npy.
 
     A value is a class id: a grey value, or an index into the palette of the PNG. Other meanings are

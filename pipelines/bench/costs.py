@@ -11,10 +11,11 @@ from pipelines.bench.results import JobResult
 # laptop: the estimate until the first jobs of the bench are finished.
 FIRST_GUESS: Mapping[str, float] = MappingProxyType({
     TRAIN: 0.16,
+    "segment": 0.05,
     "predict": 0.03,
     "repredict": 0.03,
     "points": 0.005,
-    "semantic": 0.055,
+    "semantic": 0.005,
     EVALUATE: 0.025,
 })  # fmt: skip
 # Time to start a process, load its libraries, solve, export and compute AP.

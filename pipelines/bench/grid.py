@@ -1,10 +1,12 @@
 """The grid: its jobs, their folders, their dependencies and their amounts of work."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipelines.assembly import stores_maps
 from pipelines.bench.settings import Axes
+from pipelines.engine.stage import CacheStage
 from pipelines.registry import POLICIES
 from pipelines.round import round_graph
 from pipelines.stages.methods import METHODS
@@ -98,10 +100,10 @@ def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
     first = job.method is None
     steps = section.pretrain_steps if first else section.round_steps * config.run.rounds
     passes = 1 if first else (config.run.rounds - 1) * looks_at_unlabeled(job)
-    frames = passes * (sizes.train - sizes.labeled(job.ratio))
-    return {TRAIN: steps, **dict.fromkeys(frame_stages(config), frames), EVALUATE: sizes.val}
-
-
-def frame_stages(config: Config) -> Iterator[str]:
-    """Return the names of the stages that process the frames of X_u."""
-    return (stage.name for stage in round_graph(config.run.priors).frames_stages)
+    unlabeled = sizes.train - sizes.labeled(job.ratio)
+    graph = round_graph(config.run.priors, maps=stores_maps(config))
+    frames = {
+        stage.name: unlabeled * (first if isinstance(stage, CacheStage) else passes)
+        for stage in graph.frames_stages
+    }
+    return {TRAIN: steps, **frames, EVALUATE: sizes.val}

@@ -106,7 +106,10 @@ class Bench:
         overrides = _parsed(self.settings.overrides)
         document: dict[str, Any] = {
             "dataset": {"root": self.data},
-            "segmenter": {"name": "simulated" if self.simulated else "none"},
+            "segmenter": {
+                "name": "simulated" if self.simulated else "none",
+                "cache": self.root / "maps",
+            },
             "train": {
                 "pretrain_steps": self.settings.teacher_steps or self.settings.steps,
                 "round_steps": self.settings.steps,

@@ -24,14 +24,25 @@ def run_frame_command(
     as_json: bool,
     dry_run: bool = False,
 ) -> None:
-    """Run frame stages on a split; None for the stages of the configured priors."""
+    """Run stages of frames on a split.
+
+    Args:
+        stages: names of the stages; None for those of the configured priors.
+        folder: see `WorkspaceOption`.
+        round_number: None for the first round without a student; 0 for stages of no round.
+        split: the split of the frames.
+        executor: None for the configured one.
+        workers: None for the configured number.
+        as_json: whether to print JSON.
+        dry_run: whether to print only what would run.
+    """
     from curate.errors import ConfigError
     from pipelines.assembly import check_executor
     from pipelines.category_names import check_names
     from pipelines.engine.plan import Plan
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
-    from pipelines.engine.rounds import open_round, preview_round
+    from pipelines.engine.rounds import open_round, outside_rounds, preview_round
     from pipelines.engine.runner import check_inputs, open_executor, run_frames
     from pipelines.round import graph_of
     from pipelines.workspace.splits import SPLITS
@@ -41,24 +52,28 @@ def run_frame_command(
     if split not in SPLITS:
         raise ConfigError(f"--split {split}: use one of {', '.join(SPLITS)}")
     names = priors if stages is None else stages
-    unknown = [name for name in names if name not in (*priors, "predict", "repredict")]
+    graph = graph_of(workspace)
+    unknown = [name for name in names if name not in {each.name for each in graph.frames_stages}]
     if unknown:
         raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
     check_names(workspace)
-    graph = graph_of(workspace)
     selected = [graph.frames_stage(name) for name in names]
     for stage in selected:
         if stage.check:
             stage.check(workspace)
     if dry_run:
-        context = preview_round(workspace, round_number)
+        outside = outside_rounds(workspace)
+        context = outside if round_number == 0 else preview_round(workspace, round_number)
         check_inputs(Plan(workspace, context, graph), selected, split)
         preview = Preview(workspace, graph, context.number, context)
         planned = (preview.frames_stage(stage, split, alone=True) for stage in selected)
         print_preview(planned, as_json=as_json)
         return
-    plan = Plan(workspace, open_round(workspace, round_number), graph)
+    if round_number == 0:
+        plan = Plan(workspace, outside_rounds(workspace), graph)
+    else:
+        plan = Plan(workspace, open_round(workspace, round_number), graph)
     check_inputs(plan, selected, split)
     reports = []
     with open_executor(workspace) as work:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from curate.errors import ConfigError
-from pipelines.engine.stage import FirstStage, FramesStage, RoundStage, Stage
+from pipelines.engine.stage import CacheStage, FirstStage, FramesStage, RoundStage, Stage
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,21 @@ class Graph:
         needed = set(stage.reads)
         found: list[FramesStage] = []
         for other in reversed(self.stages[: self.stages.index(stage)]):
-            if needed & set(other.writes):
+            if needed & set(other.results):
                 needed |= set(other.reads)
                 if isinstance(other, FramesStage):
                     found.insert(0, other)
         return tuple(found)
+
+    @property
+    def cache_stages(self) -> Iterator[CacheStage]:
+        """The stages that make ahead what later stages would make themselves."""
+        return (stage for stage in self.stages if isinstance(stage, CacheStage))
+
+    def readers(self, stage: CacheStage) -> tuple[FramesStage, ...]:
+        """Return the stages of frames that read what a cache stage writes."""
+        written = set(stage.writes)
+        return tuple(other for other in self.frames_stages if written & set(other.reads))
 
     def as_mermaid(self) -> str:
         """Return a Mermaid flowchart of tables (rounded) and stages (boxes)."""

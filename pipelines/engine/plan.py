@@ -29,6 +29,9 @@ The waiting frames of repredict, in SQL (state is done, empty or failed):
 A stage with reusable measurements has a fingerprint of two parts, MEASURED.ALL. If only ALL has
 changed, e.g. with `semantic.mean`, then the frame's rows are computed again from its stored
 measurements, without running the segmenter.
+
+A cache stage has its tasks in round 0, and no other stage depends on them. In a round, its waiting
+frames are those that one of its readers is going to process, so that nothing is made in vain.
 """
 
 import hashlib
@@ -38,7 +41,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, and_, false, func, not_, or_, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Select,
+    and_,
+    exists,
+    false,
+    func,
+    not_,
+    or_,
+    select,
+)
 
 from curate.datasets.base import sequences_of
 from curate.errors import WorkspaceError
@@ -46,7 +60,14 @@ from curate.firewall.sequences import group_by_sequence
 from db import bulk
 from pipelines.assembly import open_policy
 from pipelines.engine.graph import Graph
-from pipelines.engine.stage import FirstStage, FramesStage, FrameStage, RoundContext, RoundStage
+from pipelines.engine.stage import (
+    CacheStage,
+    FirstStage,
+    FramesStage,
+    FrameStage,
+    RoundContext,
+    RoundStage,
+)
 from pipelines.workspace.workspace import Workspace
 
 FINISHED = ("done", "empty")
@@ -144,7 +165,7 @@ class Plan:
                 settings = stage.reusable.settings(self.workspace, self.context)
                 measured = _fingerprint(stage.name, settings, stage.reusable.reads, inputs)
                 prints[stage.name] = f"{measured}.{prints[stage.name]}"
-            inputs |= dict.fromkeys(stage.writes, prints[stage.name])
+            inputs |= dict.fromkeys(stage.results, prints[stage.name])
         return prints
 
     @cached_property
@@ -164,16 +185,20 @@ class Plan:
                 if isinstance(stage, RoundStage):
                     settings = stage.settings(self.workspace, self.context, policy)
                     prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, inputs)
-                inputs |= dict.fromkeys(stage.writes, prints[stage.name])
+                inputs |= dict.fromkeys(stage.results, prints[stage.name])
             self._by_policy[policy] = prints
         return self._by_policy[policy]
+
+    def round_of(self, stage: FramesStage) -> int:
+        """Return the round of a stage's tasks: 0 for a stage that depends on no round."""
+        return 0 if isinstance(stage, CacheStage) else self.context.number
 
     def fingerprint(self, stage: FramesStage) -> str:
         """Return the current fingerprint of a stage of frames."""
         return self._of_frames[stage.name]
 
     def waiting_frames(
-        self, stage: FrameStage, split: str, *, measured: bool
+        self, stage: FrameStage | CacheStage, split: str, *, measured: bool
     ) -> Iterator[WaitingFrame]:
         """Yield the frames that a stage has to process.
 
@@ -320,17 +345,31 @@ class Plan:
         """
         query, own_task = self._ready(stage, split)
         current = self.fingerprint(stage)
-        reusable = and_(
-            own_task.c.id.is_not(None),
-            func.coalesce(own_task.c.state, "") == "done",
-            func.coalesce(own_task.c.fingerprint, "").startswith(current.partition(".")[0] + "."),
-        )
         undone = or_(
             own_task.c.id.is_(None),
             own_task.c.fingerprint != current,
             own_task.c.state.not_in(FINISHED),
         )
-        return query.where(undone), reusable
+        query = query.where(undone)
+        if isinstance(stage, CacheStage):
+            query = query.where(or_(*map(self._will_read, self.graph.readers(stage))))
+        return query, self._is_measured(own_task, stage)
+
+    def _is_measured(self, task: Any, stage: FramesStage) -> ColumnElement[bool]:
+        """Return the condition that a task's measurements are still valid; it is never null."""
+        measured = self.fingerprint(stage).partition(".")[0]
+        return and_(
+            task.c.id.is_not(None),
+            func.coalesce(task.c.state, "") == "done",
+            func.coalesce(task.c.fingerprint, "").startswith(f"{measured}."),
+        )
+
+    def _will_read(self, reader: FramesStage) -> ColumnElement[bool]:
+        """Return the condition that a stage has yet to read a frame, with what a cache holds."""
+        task = bulk.table("task").alias(f"task_{reader.name}")
+        finished = and_(task.c.fingerprint == self.fingerprint(reader), task.c.state.in_(FINISHED))
+        read = or_(finished, self._is_measured(task, reader))
+        return not_(exists().where(self._task_of(task, reader), read))
 
     def _ready(self, stage: FramesStage, split: str) -> tuple[Select[Any], Any]:
         """Return the query for frames that all earlier stages have finished, and the stage's tasks.
@@ -366,7 +405,7 @@ class Plan:
         """Return, by frame key, the states of the tasks with the current fingerprint."""
         task = bulk.table("task")
         query = select(task.c.frame_id, task.c.state).where(
-            task.c.round == self.context.number,
+            task.c.round == self.round_of(stage),
             task.c.stage == stage.name,
             task.c.fingerprint == self.fingerprint(stage),
             task.c.frame_id.is_not(None),
@@ -376,7 +415,7 @@ class Plan:
     def _task_of(self, task: Any, stage: FramesStage) -> ColumnElement[bool]:
         """Return the condition that joins a frame with its task of a stage."""
         return and_(
-            task.c.round == self.context.number,
+            task.c.round == self.round_of(stage),
             task.c.stage == stage.name,
             task.c.frame_id == bulk.table("frame").c.id,
         )

@@ -22,8 +22,14 @@ from db import bulk
 from pipelines.engine.executors.machine import usable_cores
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import FINISHED, Plan, TaskKey, digest, is_current
-from pipelines.engine.rounds import is_student_trained, preview_round, recorded_config
+from pipelines.engine.rounds import (
+    is_student_trained,
+    outside_rounds,
+    preview_round,
+    recorded_config,
+)
 from pipelines.engine.stage import (
+    CacheStage,
     FirstStage,
     FramesStage,
     FrameStage,
@@ -74,6 +80,7 @@ def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Itera
     """Yield, stage by stage, what `run_all` would do with the same arguments."""
     trained = is_student_trained(workspace)
     changing = []
+    ahead: dict[str, set[str]] = {}
     for first in graph.first_stages:
         planned = preview_first(workspace, first)
         if planned.reasons:
@@ -81,7 +88,7 @@ def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Itera
         yield planned
     for number in range(1, ((rounds or workspace.config.run.rounds) if trained else 1) + 1):
         context = None if changing else preview_round(workspace, number, rounds)
-        preview = Preview(workspace, graph, number, context)
+        preview = Preview(workspace, graph, number, context, ahead)
         for stage in graph.stages:
             if isinstance(stage, FramesStage):
                 yield preview.frames_stage(stage)
@@ -116,12 +123,20 @@ class Preview:
         graph: the stages.
         number: number e of the round.
         context: the round; None if its teacher is not trained yet.
+        ahead: the frames that each cache stage would process before this round; those of this
+            round are added.
     """
 
     def __init__(
-        self, workspace: Workspace, graph: Graph, number: int, context: RoundContext | None
+        self,
+        workspace: Workspace,
+        graph: Graph,
+        number: int,
+        context: RoundContext | None,
+        ahead: dict[str, set[str]] | None = None,
     ) -> None:
         self._workspace = workspace
+        self._ahead = {} if ahead is None else ahead
         self._graph = graph
         self._number = number
         self._plan = None if context is None else Plan(workspace, context, graph)
@@ -139,7 +154,9 @@ class Preview:
                 are then left out.
         """
         names = self._workspace.frames(split)
-        if self._plan is None:
+        if isinstance(stage, CacheStage):
+            found = self._to_be_made(stage, names)
+        elif self._plan is None:
             found = dict.fromkeys(names, _Reason("its teacher is still to be trained"))
         else:
             found = self._stale_frames(self._plan, stage, names)
@@ -157,7 +174,7 @@ class Preview:
         )
         costly = sum(not why.measured for why in found.values())
         return PlannedStage(
-            self._number,
+            0 if isinstance(stage, CacheStage) else self._number,
             stage.name,
             len(found),
             tuple(sorted(found)[:SHOWN_FRAMES]),
@@ -186,6 +203,20 @@ class Preview:
         seconds = _seconds(self._workspace, stage, 1, reasons)
         return PlannedStage(self._number, stage.name, None, (), reasons, seconds)
 
+    def _to_be_made(self, stage: CacheStage, names: Mapping[str, int]) -> dict[str, _Reason]:
+        """Return the frames that a cache stage would process: a reader would process them too."""
+        outside = Plan(self._workspace, outside_rounds(self._workspace), self._graph)
+        found = self._stale_frames(outside, stage, names)
+        if self._plan:
+            readers = self._graph.readers(stage)
+            stale = [self._stale_frames(self._plan, reader, names) for reader in readers]
+            read = {name for each in stale for name, why in each.items() if not why.measured}
+            found = {name: why for name, why in found.items() if name in read}
+        before = self._ahead.setdefault(stage.name, set())
+        found = {name: why for name, why in found.items() if name not in before}
+        before |= set(found)
+        return found
+
     def _stale_frames(
         self, plan: Plan, stage: FramesStage, names: Mapping[str, int]
     ) -> dict[str, _Reason]:
@@ -210,7 +241,7 @@ class Preview:
         """Return, by frame key, state and fingerprint of the stage's tasks."""
         task = bulk.table("task")
         query = select(task.c.frame_id, task.c.state, task.c.fingerprint).where(
-            task.c.round == self._number,
+            task.c.round == (0 if isinstance(stage, CacheStage) else self._number),
             task.c.stage == stage.name,
             task.c.frame_id.is_not(None),
         )
@@ -243,7 +274,7 @@ class Preview:
     def _changing_inputs(self, stage: Stage) -> list[str]:
         """Return the names of the stages that would change the input of a stage."""
         reads = set(stage.reads)
-        return [other.name for other in self._changing if reads & set(other.writes)]
+        return [other.name for other in self._changing if reads & set(other.results)]
 
     def _why(self, stage: FramesStage | RoundStage, policy: str) -> str:
         """Return why the fingerprint of a stage differs from that of its last run."""

@@ -67,6 +67,12 @@ def open_round(
     return RoundContext(number, rounds, workspace.config.run.seed, teacher)
 
 
+def outside_rounds(workspace: Workspace) -> RoundContext:
+    """Return the context of work that depends on no round and no teacher."""
+    run = workspace.config.run
+    return RoundContext(0, run.rounds, run.seed, Teacher(Path(), ""))
+
+
 def choose_round(workspace: Workspace, number: int | None, rounds: int | None) -> tuple[int, int]:
     """Return the number e of the round to work on and the number E of rounds, see `open_round`."""
     students = _students(workspace)
@@ -99,13 +105,15 @@ def recorded_config(workspace: Workspace, number: int) -> dict[str, Any] | None:
 
 
 def _recorded_config(workspace: Workspace) -> str:
-    """Return the configuration as JSON, without database URL and what changes only the speed.
+    """Return the configuration as JSON, without the settings that change no result.
 
-    Processes that differ only in these can share a round, and the URL may contain a password.
+    Processes that differ only in these can share a round, and the database's URL may contain a
+    password.
     """
     exclude = {
         "run": {"executor", "workers", "database"},
         "detector": {"batch_size", "workers", "timeout_s"},
+        "segmenter": {"cache", "cache_limit"},
         "train": {"threads"},
     }
     return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))

@@ -4,6 +4,7 @@ The process that runs a stage is its only writer. Rows and task states of a batc
 transaction, so a frame is stored completely or not at all, even if the process is killed.
 """
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from sqlalchemy import Connection, select
 
 from curate.files.batches import batched
 from db import bulk
+from db.claims import Resource, round_resources
 from pipelines import registry
 from pipelines.engine.executors.base import (
     Executor,
@@ -31,8 +33,10 @@ from pipelines.engine.mapping import map_frames
 from pipelines.engine.plan import Plan, TaskKey, WaitingFrame, digest, is_current
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import (
+    CacheStage,
     FirstStage,
     FramesStage,
+    FrameStage,
     Product,
     ReusableMeasurements,
     RoundJob,
@@ -40,6 +44,8 @@ from pipelines.engine.stage import (
     Stage,
 )
 from pipelines.workspace.workspace import Workspace
+
+_log = logging.getLogger(__name__)
 
 READ_AHEAD = 256  # frames per query of predictions and measurements
 FLUSH_FRAMES = 64
@@ -111,8 +117,10 @@ def run_frames(
     Raises:
         DatabaseError: if another process works on the round; the message says which one.
     """
-    database, number = plan.workspace.database, plan.context.number
-    with database.claiming_round(number, None, stage.name):
+    database, number = plan.workspace.database, plan.round_of(stage)
+    # A cache stage may run beside the stages of all rounds.
+    resources = [Resource(f"stage {stage.name}")] if number == 0 else round_resources(number)
+    with database.claiming(resources, stage.name):
         start = time.perf_counter()
         if stage.prepare:
             stage.prepare(plan.workspace)
@@ -243,17 +251,31 @@ def _outcomes(
     else:
         frames = plan.waiting_frames(stage, split, measured=False)
         jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip)
+        if isinstance(stage, CacheStage):
+            jobs = _until_refused(jobs, stage, plan.workspace)
     # Load the models only if there is a first job.
     for first in jobs:
         function: JobFunction = stage.function(plan.workspace, plan.context)
         yield from map_frames(executor, function, chain([first], jobs), total)
-    if isinstance(stage, SequenceStage) or not stage.reusable:
+    if not isinstance(stage, FrameStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)
     jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip, stage.reusable)
     for first in jobs:
         function = stage.reusable.function(plan.workspace, plan.context)
         yield from SerialExecutor().map(function, chain([first], jobs))
+
+
+def _until_refused(
+    jobs: Iterable[FrameJob], stage: CacheStage, workspace: Workspace
+) -> Iterator[FrameJob]:
+    """Yield jobs while the stage can store what it makes; then report why it cannot."""
+    refusal = stage.refusal(workspace)
+    for job in jobs:
+        if reason := refusal():
+            _log.warning("%s ends early: %s; nothing is lost", stage.name, reason)
+            return
+        yield job
 
 
 def _frame_jobs(
@@ -297,7 +319,7 @@ class _Writer:
 
     def __init__(self, plan: Plan, stage: FramesStage) -> None:
         self._database = plan.workspace.database
-        self.round = plan.context.number
+        self.round = plan.round_of(stage)
         self.stage = stage
         self.fingerprint = plan.fingerprint(stage)
         self._sequence_stages = [
@@ -333,7 +355,7 @@ class _Writer:
         frames = [pair for outcome in outcomes for pair in _frames_of(outcome)]
         with self._database.writing() as connection:
             self._clear(connection, [job.frame_id for job, _ in frames])
-            for table in self.stage.writes:
+            for table in self.stage.results:
                 columns = _joined([(job.frame_id, rows.get(table, {})) for job, rows in frames])
                 if columns["frame_id"]:
                     bulk.insert(connection, table, {"round": self.round, **columns})
@@ -351,14 +373,18 @@ class _Writer:
     def _state(self, outcome: Outcome, rows: FrameRows) -> str:
         if outcome.error is not None:
             return "failed"
-        return "done" if _length(rows.get(self.stage.writes[-1], {})) else "empty"
+        return "done" if self._rows(rows) or not self.stage.results else "empty"
+
+    def _rows(self, rows: FrameRows) -> int:
+        """Return the number of rows of a frame in the stage's main table."""
+        return sum(_length(rows.get(table, {})) for table in self.stage.results[-1:])
 
     def _count(self, outcome: Outcome, job: FrameJob, rows: FrameRows) -> None:
         state = self._state(outcome, rows)
         self.done += state == "done"
         self.empty += state == "empty"
         self.failed += state == "failed"
-        self.labels += _length(rows.get(self.stage.writes[-1], {}))
+        self.labels += self._rows(rows)
         if outcome.error is not None:
             self.errors.append((job.frame, outcome.error))
 
@@ -369,10 +395,10 @@ class _Writer:
         task of such evidence stayed, the frame would count as done after a change back to the
         former settings.
         """
-        whole = "prediction" in self.stage.writes
+        whole = "prediction" in self.stage.results
         if whole:  # first: the weights, which are deleted below, show which policies are affected
             self._delete_weight_tasks(connection, keys)
-        for table in self.stage.writes:
+        for table in self.stage.results:
             bulk.delete_frames(connection, table, self.round, keys)
         task = bulk.table("task")
         here = (task.c.round == self.round, task.c.frame_id.in_(keys))

@@ -35,7 +35,7 @@ class RoundContext:
     """A round and its teacher.
 
     Attributes:
-        number: number e of the round, from 1.
+        number: number e of the round, from 1; 0 for work that depends on no round.
         rounds: number E of rounds.
         seed: seed of the workspace.
         teacher: the detector that predicts.
@@ -117,6 +117,11 @@ class _Stage:
     reads: tuple[str, ...]
     writes: tuple[str, ...]
 
+    @property
+    def results(self) -> tuple[str, ...]:
+        """What it writes that other stages depend on."""
+        return self.writes
+
 
 @dataclass(frozen=True, kw_only=True)
 class FirstStage(_Stage):
@@ -167,6 +172,29 @@ class FrameStage(_FramesStage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CacheStage(_FramesStage):
+    """A stage that makes ahead, once per frame, what later stages would make themselves.
+
+    It depends on no round: its tasks are those of round 0. As its readers get the same with or
+    without it, no stage waits for it, and no fingerprint depends on it. In a round it processes
+    only frames that one of its readers will read.
+
+    Attributes:
+        function: function that returns what the stage does with a frame; it returns no rows.
+        refusal: function that returns a function, which returns why nothing further can be stored;
+            "" if it can. The stage then ends early.
+    """
+
+    function: Callable[[Workspace, RoundContext], FrameFunction]
+    refusal: Callable[[Workspace], Callable[[], str]]
+
+    @property
+    def results(self) -> tuple[str, ...]:
+        """Nothing: no result depends on a cache."""
+        return ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class SequenceStage(_FramesStage):
     """A stage that processes all frames of a sequence together.
 
@@ -202,6 +230,6 @@ class RoundStage(_Stage):
     check: Callable[[Workspace, str], None] | None = None
 
 
-FramesStage = FrameStage | SequenceStage
-"""A stage with rows that belong to frames."""
-Stage = FirstStage | FrameStage | SequenceStage | RoundStage
+FramesStage = FrameStage | CacheStage | SequenceStage
+"""A stage that processes frames."""
+Stage = FirstStage | FramesStage | RoundStage

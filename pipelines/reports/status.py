@@ -8,8 +8,13 @@ from sqlalchemy import select, text
 from curate.errors import WorkspaceError
 from db import bulk
 from pipelines.engine.plan import Plan
-from pipelines.engine.rounds import find_teacher, is_student_trained, stored_round
-from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
+from pipelines.engine.rounds import (
+    find_teacher,
+    is_student_trained,
+    outside_rounds,
+    stored_round,
+)
+from pipelines.engine.stage import CacheStage, FirstStage, FramesStage, RoundStage
 from pipelines.labels.human_labels import counts, decided_frames
 from pipelines.round import graph_of
 from pipelines.workspace.workspace import Workspace
@@ -28,6 +33,8 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
     trained = is_student_trained(workspace)
     graph = graph_of(workspace)
     rows = [_first_row(workspace, first) for first in graph.first_stages]
+    outside = Plan(workspace, outside_rounds(workspace), graph)
+    rows += [row for stage in graph.cache_stages for row in _frame_rows(outside, stage)]
     for number in numbers:
         context = stored_round(workspace, number)
         if context is None:
@@ -35,6 +42,8 @@ def overview(workspace: Workspace) -> tuple[Sequence[str], list[tuple[Any, ...]]
             continue
         plan = Plan(workspace, context, graph)
         for stage in graph.stages:
+            if isinstance(stage, CacheStage):
+                continue
             if isinstance(stage, FramesStage):
                 rows += _frame_rows(plan, stage)
             elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
@@ -82,7 +91,7 @@ def _frame_rows(plan: Plan, stage: FramesStage) -> Iterator[tuple[Any, ...]]:
             continue
         state = "done" if not found.waiting else ("waiting" if not touched else "partly")
         yield (
-            plan.context.number, stage.name, split, "", state,
+            plan.round_of(stage), stage.name, split, "", state,
             found.done, found.empty, found.failed, found.waiting,
         )  # fmt: skip
 

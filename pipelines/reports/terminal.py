@@ -266,7 +266,8 @@ def print_report(report: "Report") -> None:
     if report.summary:
         line += report.summary
     else:
-        line += f"{report.done} frames done, {report.labels} rows"
+        line += f"{report.done} frames done"
+        line += f", {report.labels} rows" if report.round else ""  # work of no round has no rows
         states: Mapping[str, int] = {"empty": report.empty, "failed": report.failed}
         line += "".join(f", {n} {state}" for state, n in states.items() if n)
         line += f", {report.kept} already done" if report.kept else ""

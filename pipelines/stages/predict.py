@@ -36,7 +36,16 @@ Item = TypeVar("Item")
 
 # Settings of detectors and segmenters that change no result, and the path, of which the content
 # counts.
-_WITHOUT_EFFECT = ("path", "augmented", "batch_size", "workers", "timeout_s", "providers")
+_WITHOUT_EFFECT = (
+    "path",
+    "augmented",
+    "batch_size",
+    "workers",
+    "timeout_s",
+    "providers",
+    "cache",
+    "cache_limit",
+)
 # Frames of the first batch of a command.
 TRIAL_FRAMES = 8
 

@@ -155,8 +155,13 @@ class ScoreSequence:
         ]
 
 
-def stage(source: Source) -> FramesStage:
-    """Return the stage of a source."""
+def stage(source: Source, maps: Sequence[str] = ()) -> FramesStage:
+    """Return the stage of a source.
+
+    Args:
+        source: the source.
+        maps: what a source with a segmenter reads besides: the stored maps, if there are any.
+    """
     name = source.configured
     if source.of_sequences:
         return SequenceStage(
@@ -169,10 +174,11 @@ def stage(source: Source) -> FramesStage:
             prepare=partial(prepare_stage, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
+    shown = tuple(maps) if PRIORS.takes(name, "segmenter") else ()
     return FrameStage(
         name,
         command=f"score --prior {name}",
-        reads=("frame", *learns, "prediction"),
+        reads=("frame", *learns, *shown, "prediction"),
         writes=(source.table,),
         settings=partial(_settings, source),
         function=partial(_function, Score, name),
@@ -187,13 +193,22 @@ def stage(source: Source) -> FramesStage:
     )
 
 
-def stages(names: Sequence[str]) -> tuple[FramesStage, ...]:
+def stages(names: Sequence[str], maps: Sequence[str] = ()) -> tuple[FramesStage, ...]:
     """Return the stages of several sources.
+
+    Args:
+        names: names of the sources.
+        maps: see `stage`.
 
     Raises:
         ConfigError: if one is unknown or invalid, or two share a name or a column.
     """
-    return tuple(map(stage, sources_of(names)))
+    return tuple(stage(source, maps) for source in sources_of(names))
+
+
+def reads_maps(names: Sequence[str]) -> bool:
+    """Return whether one of the sources has a segmenter."""
+    return any(PRIORS.takes(name, "segmenter") for name in names)
 
 
 def _check(name: str, workspace: Workspace) -> None:

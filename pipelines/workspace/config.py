@@ -308,6 +308,18 @@ class SegmenterSection(Section):
         default={},
         description="Further arguments of the segmenter's class; see docs/segmenters.md.",
     )
+    cache: Path | None = Field(
+        default=None,
+        description="Folder of the stored semantic maps. Without it, maps in the workspace. "
+        "Workspaces with the same images and segmenter can share one.",
+        examples=["/data/kitti-maps"],
+    )
+    cache_limit: NonNegative = Field(
+        default=20.0,
+        description="Largest size of this folder. Maps beyond it are not stored, but made again "
+        "each time they are needed. 0 stores no map.",
+        json_schema_extra=_unit("GiB"),
+    )
 
 
 class RepredictSection(Section):

@@ -52,8 +52,7 @@ def why_not_segmented(config: Config, dataset: Dataset) -> str:
     if not _has_camera(dataset, first):
         return "the data set has no camera, so the semantic prior cannot be computed"
     name = "onnx" if config.segmenter.name == "simulated" else config.segmenter.name
-    reads_images = name != "none" and getattr(registry.SEGMENTERS.load(name), "needs_image", True)
-    if reads_images:
+    if name != "none" and registry.SEGMENTERS.declared(name, "needs_image"):
         return f"the data set has no images, which segmenter '{config.segmenter.name}' needs"
     return ""
 

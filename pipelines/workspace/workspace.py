@@ -73,7 +73,8 @@ class Workspace:
             write_schema(root)
         else:
             write_config(path, config)
-        return cls(root, config, Database(url_of(root, config), root))
+        anchored = _anchored(root, config)
+        return cls(root, anchored, Database(url_of(root, anchored), root))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
         """Return the same workspace with other settings in a section, for this command only.
@@ -224,6 +225,9 @@ def _anchored(root: Path, config: Config) -> Config:
         update = {key: root / path for key, path in found.items() if path is not None}
         if update:
             changes[name] = section.model_copy(update=update)
+    segmenter = changes.get("segmenter", config.segmenter)
+    cache = root / (segmenter.cache or "maps")
+    changes["segmenter"] = segmenter.model_copy(update={"cache": cache})
     return config.model_copy(update=changes)
 
 

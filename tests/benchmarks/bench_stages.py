@@ -171,6 +171,17 @@ def bench_semantic(benchmark, workspace, context, guesses):
     assert len(rows["semantic_prior"]["k"]) > CLUTTER
 
 
+def bench_semantic_with_stored_maps(benchmark, workspace, context, guesses):
+    """The same with the maps of the simulated segmenter, which `segment` has stored."""
+    simulated = workspace.with_settings("segmenter", name="simulated", path=None, classes=None)
+    stage = score.stage(source_of("semantic")).function(simulated, context)
+    stage.open()
+    for frame, found in guesses.items():
+        stage(FrameJob(0, frame, found))
+    rows = of_jobs(benchmark, guesses, stage, "score --prior semantic, stored maps")
+    assert len(rows["semantic_prior"]["k"]) > CLUTTER
+
+
 def bench_solve(benchmark):
     """Solve the closed form over a million labels of 20,000 frames, in memory."""
     generator = np.random.default_rng(0)

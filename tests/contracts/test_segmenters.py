@@ -138,6 +138,18 @@ def test_maps_do_not_depend_on_earlier_calls(made, segmenter, frames) -> None:
         np.testing.assert_array_equal(segmenter.segment(frame).class_ids, expected)
 
 
+def test_a_map_that_is_stored_depends_on_the_image_alone(segmenter, frames) -> None:
+    """Not on the name of the frame, its camera, its points or its calibration."""
+    if segmenter.map_version is None:
+        return
+    assert isinstance(segmenter.map_version, int)
+    one, other = frames[:2]
+    renamed = replace(other, image=one.image, image_size=one.image_size, camera="other")
+    np.testing.assert_array_equal(
+        segmenter.segment(renamed).class_ids, segmenter.segment(one).class_ids
+    )
+
+
 def test_a_frame_is_not_modified_and_its_points_are_not_used(segmenter, frames) -> None:
     """The image is read-only, and there are no points."""
     image = frames[0].image.copy()

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ from support.pipelines_cli import Curate
 from support.toys import toy_calibration, write_toy_kitti
 
 from curate.datasets.nuscenes import NuScenesDataset
+from pipelines.assembly import open_segmenter
 from pipelines.serving.shown_frames import FramePages
 from pipelines.workspace.workspace import Workspace
 
@@ -252,6 +254,39 @@ def scored(
     )
     assert code == 0, err
     return list(csv.DictReader(io.StringIO(out)))
+
+
+def test_each_camera_gets_the_stored_map_of_its_own_image(
+    nuscenes: Path, tmp_path: Path, curate: Curate
+) -> None:
+    """Made ahead by segment for all six, and read for each."""
+    dataset = NuScenesDataset(nuscenes, cameras="all")
+    generator = np.random.default_rng(0)
+    for name in dataset.frame_ids():
+        for path in dataset.files(name).images:
+            bright = generator.integers(0, 2, (IMAGE_SIZE[1], IMAGE_SIZE[0], 1)) * np.full(3, 255)
+            cv2.imwrite(str(path), bright.astype(np.uint8))
+    work, model = tmp_path / "work", tmp_path / "model"
+    model.touch()
+    code, _, err = curate(
+        "init", work, "--dataset", "nuscenes", "--root", nuscenes, "--labeled", "0.5",
+        "--dataset-option", "cameras=all", "--detector", "recorded",
+        "--detector-path", write_results(tmp_path / "results.json"),
+        "--segmenter", "support.toys:ToyImageSegmenter", "--segmenter-path", model,
+    )  # fmt: skip
+    assert code == 0, err
+    code, _, err = curate("segment", "--workspace", work)
+    assert code == 0, err
+    workspace = Workspace.open(work)
+    names = list(workspace.frames("unlabeled"))
+    segmented = (tmp_path / "segmented.txt").read_text().split()  # init has segmented one frame
+    assert sorted(each for each in segmented if each in names) == sorted(names * len(CAMERAS))
+    segmenter = open_segmenter(workspace.config)
+    for name in names:
+        for view in dataset.read(name, image=True).views():
+            found = segmenter.segment(replace(view, image=None)).class_ids
+            np.testing.assert_array_equal(found == 1, view.image[..., 0] >= 128)
+    assert (tmp_path / "segmented.txt").read_text().split() == segmented
 
 
 def test_six_cameras_give_labels_of_every_direction_image_evidence(

@@ -52,8 +52,11 @@ def contents(root: Path) -> tuple[list[str], dict[Path, bytes]]:
 
 def test_every_stage_command_has_the_option() -> None:
     """Every stage is listed."""
-    stages = {"pretrain", "predict", "repredict", "score", "solve", "export", "train-round", "run"}
-    assert with_option("--dry-run") == stages | {"review import"}
+    stages = {
+        "pretrain", "segment", "predict", "repredict", "score", "solve", "export", "train-round",
+        "run",
+    }  # fmt: skip
+    assert with_option("--dry-run") == stages | {"augment", "review import"}
 
 
 def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None:

@@ -185,6 +185,31 @@ class ToySegmenter:
         return SemanticMap(class_ids, {"Car": (1,), "Pedestrian": (2,), "Cyclist": (1, 2)})
 
 
+class ToyImageSegmenter(ToySegmenter):
+    """Segment the bright pixels as car and the others as person; each call adds a line to a file.
+
+    Args:
+        path: a file; beside it, the calls are counted.
+        bright: the lowest red value of a bright pixel.
+        seen: the calls are counted in a file of this name.
+    """
+
+    map_version = 1
+
+    def __init__(self, path: Path, *, bright: int = 128, seen: str = "segmented.txt") -> None:
+        super().__init__(path)
+        self.bright = bright
+        self.seen = path.with_name(seen)
+
+    def segment(self, frame: Frame) -> SemanticMap:
+        """Return the semantic map."""
+        found = super().segment(frame)
+        with self.seen.open("a") as file:
+            file.write(f"{frame.frame_id}\n")
+        class_ids = np.where(frame.image[..., 0] >= self.bright, np.uint8(1), np.uint8(2))
+        return SemanticMap(class_ids, found.category_classes)
+
+
 @dataclass(frozen=True)
 class ToyPrior(EvidenceSource):
     """A user-supplied prior: an integer and a real number are measured."""

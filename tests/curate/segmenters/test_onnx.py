@@ -12,6 +12,7 @@ from support.tiny_onnx import constant_model as constant_outputs
 from support.toys import toy_calibration
 
 from curate.errors import ConfigError, ModelError
+from curate.files.onnx_session import OnnxModel
 from curate.frames import Frame
 from curate.segmenters.classes import class_map
 from curate.segmenters.onnx import OnnxSegmenter, cut_along
@@ -123,7 +124,7 @@ def test_crops_cover_the_image_and_own_the_nearest_columns():
     assert [crop.own_right for crop in crops[:-1]] == [crop.own_left for crop in crops[1:]]
 
 
-def test_more_crops_are_used_if_five_do_not_cover(tmp_path):
+def test_more_crops_are_used_if_two_do_not_cover(tmp_path):
     """An image of 10 : 1 is covered by ten square crops."""
     path = red_channel_model(tmp_path / "a.onnx", [1, 16, 16, 3])
     image = banded(16, 160, [7, 15] * 10)
@@ -131,12 +132,65 @@ def test_more_crops_are_used_if_five_do_not_cover(tmp_path):
     np.testing.assert_array_equal(found, image[..., 0])
 
 
+@pytest.mark.parametrize("kind", ["uint8", "float"])
+def test_crops_go_through_a_model_with_a_free_batch_axis_as_one_batch(tmp_path, monkeypatch, kind):
+    """The model runs once per image, and the map is that of a model of batches of 1."""
+    make = red_channel_model if kind == "uint8" else brightest_channel_model
+    shapes = {
+        free: [free, 16, 16, 3] if kind == "uint8" else [free, 3, 16, 16] for free in ("n", 1)
+    }
+    image = np.random.default_rng(0).integers(0, 256, (16, 70, 3), dtype=np.uint8)
+    runs = []
+    real = OnnxModel.run
+
+    def run(model, inputs, outputs=None):
+        runs.append(len(inputs["image"]))
+        return real(model, inputs, outputs)
+
+    monkeypatch.setattr(OnnxModel, "run", run)
+    maps = [
+        OnnxSegmenter(make(tmp_path / f"{free}.onnx", shape), CLASSES).segment(frame(image))
+        for free, shape in shapes.items()
+    ]
+    np.testing.assert_array_equal(*(found.class_ids for found in maps))
+    assert runs == [5, 1, 1, 1, 1, 1]
+
+
+def test_a_model_whose_inside_takes_one_image_gets_one_after_the_other(tmp_path):
+    """Its input declares a free batch axis, but it is reshaped to one image."""
+    nodes = [
+        helper.make_node("Reshape", ["image", "one"], ["single"]),
+        helper.make_node("Gather", ["single", "zero"], ["red"], axis=3),
+        helper.make_node("Cast", ["red"], ["answer"], to=TensorProto.INT64),
+    ]
+    constants = [("one", np.array([1, 16, 16, 3])), ("zero", np.array(0))]
+    shape = ["n", 16, 16, 3]
+    path = model(tmp_path / "a.onnx", nodes, shape, TensorProto.UINT8, constants)
+    segmenter = OnnxSegmenter(path, CLASSES)
+    image = banded(16, 64, [7, 15] * 4)
+    for _ in range(2):
+        found = segmenter.segment(frame(image)).class_ids
+        np.testing.assert_array_equal(found, image[..., 0])
+
+
+def test_as_many_crops_are_used_as_cover_the_image(tmp_path, monkeypatch):
+    """More only if they are configured; none where the whole image fits."""
+    path = red_channel_model(tmp_path / "a.onnx", [1, 16, 16, 3])
+    runs = []
+    real = OnnxModel.run
+    monkeypatch.setattr(OnnxModel, "run", lambda *given: runs.append(1) or real(*given))
+    for width, tiles, expected in ((53, None, 4), (53, 3, 4), (53, 6, 6), (20, None, 1)):
+        runs.clear()
+        OnnxSegmenter(path, CLASSES, tiles=tiles).segment(frame(banded(16, width, [7])))
+        assert len(runs) == expected
+
+
 def test_a_category_wins_where_crops_overlap(tmp_path):
     """The nearest crop predicts background, the other one car: car. Other classes do not win so."""
     class_ids = np.zeros((16, 16), np.uint8)
     class_ids[:8, :4] = 7
     class_ids[8:, :4] = 3
-    segmenter = OnnxSegmenter(constant_model(tmp_path / "a.onnx", class_ids), CLASSES)
+    segmenter = OnnxSegmenter(constant_model(tmp_path / "a.onnx", class_ids), CLASSES, tiles=5)
     found = segmenter.segment(frame(np.zeros((16, 40, 3), np.uint8))).class_ids
     crops = cut_along(40, 16, 5)
     cars, others = np.zeros(40, bool), np.zeros(40, bool)

@@ -29,6 +29,8 @@ from pipelines.workspace.workspace import Workspace
 # The commands, and the stage that they start with: all stages before it are up to date.
 COMMANDS = {
     "init": None,
+    "segment": "segment",
+    "segment --workers 2": "segment",
     "predict": "predict",
     "predict --workers 2": "predict",
     "repredict": "repredict",
@@ -151,15 +153,18 @@ class Case:
         assert self.forks.end(pid) == 0, self.arguments
 
     def _results(self) -> list[tuple]:
-        """Return all that a finished run stores: rows, the exported file, students, backups."""
+        """Return all that a finished run stores: rows, exported file, students, maps, backups."""
         workspace = Workspace.open(self.workspace)
         run_workspace(workspace)
         rows = dump(workspace)
         workspace.database.close()
         with closing(sqlite3.connect(self.workspace / "exports" / "labels.sqlite")) as labels:
             rows += [("exported", line) for line in labels.iterdump()]
-        students = sorted((self.workspace / "checkpoints").glob("*.*"))
-        rows += [(path.name, path.read_bytes()) for path in students]
+        files = [
+            *(self.workspace / "checkpoints").glob("*.*"),
+            *self.workspace.glob("maps/*/*/*.gz"),
+        ]
+        rows += [(path.name, path.read_bytes()) for path in sorted(files)]
         return rows + [(path.name,) for path in self.workspace.glob("*.backup")]
 
 
@@ -168,6 +173,7 @@ def settings(home: Path) -> dict:
     (home / "trainer.py").write_text(TRAINER)
     command = f"{shlex.join([sys.executable, str(home / 'trainer.py')])} {{output}}"
     document = toy_document(home / "kitti", home / "detector.txt")
+    document["segmenter"]["name"] = "support.toys:ToyImageSegmenter"
     return document | {"run": {"rounds": 1}, "train": {"command": command}}
 
 

@@ -269,4 +269,4 @@ def test_the_default_round_has_a_stage_per_registered_prior() -> None:
     alone = [each.name for each in round_graph(("semantic",)).stages]
     assert alone == [name for name in names if name not in PRIORS.classes or name == "semantic"]
     assert graph.stage("points").reads == ("frame", "ground_truth", "prediction")
-    assert graph.stage("semantic").reads == ("frame", "prediction")
+    assert graph.stage("semantic").reads == ("frame", "maps", "prediction")
