@@ -283,8 +283,9 @@ def open_map_store(config: Config) -> MapStore:
 def made_by(config: Config) -> dict[str, Any]:
     """Return everything besides the image that the maps of the configured segmenter depend on.
 
-    Names of categories that are changed by `segmenter.rename` and the place of the model are not
-    part of it.
+    Names of categories that are changed by `segmenter.rename`, the place of the model and the
+    providers that run it are not part of it; options of providers are, since they can lower the
+    precision.
     """
     name, path = _segmenter_name(config), segmenter_path(config)
     arguments = registry.SEGMENTERS.arguments(
@@ -293,6 +294,8 @@ def made_by(config: Config) -> dict[str, Any]:
         offered=_segmenter_arguments(config),
         options=config.segmenter.options,
     )
+    if config.segmenter.provider_options:
+        arguments = {**arguments, "provider_options": config.segmenter.provider_options}
     return {
         "segmenter": registry.SEGMENTERS.classes.get(name, name),
         "map_version": registry.SEGMENTERS.declared(name, "map_version"),

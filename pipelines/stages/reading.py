@@ -1,9 +1,10 @@
 """Reading frames in threads, before a model on a GPU needs them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from curate.frames import Frame
+from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.executors.machine import usable_cores
 
 _MOST_THREADS = 8
@@ -30,3 +31,24 @@ class FrameReader:
         """Return a frame; an error in reading it is raised here."""
         ahead = self._ahead.pop(name, None)
         return self._read(name) if ahead is None else ahead.result()
+
+
+class ReadsAhead:
+    """The part of a stage's function that has a model which may run on a GPU, see `DeviceFunction`.
+
+    Attributes:
+        exclusive: whether the model runs on a device that workers should not share.
+        read: reads the frames.
+    """
+
+    exclusive: bool
+    read: FrameReader
+
+    @property
+    def workers(self) -> int | None:
+        """How many workers run the model at the same time; None for all of them."""
+        return 1 if self.exclusive else None
+
+    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
+        """Begin to read the frames of the next call."""
+        self.read.announce(job.frame for job in jobs)

@@ -39,14 +39,14 @@ from pipelines.engine.stage import (
 from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.stages.predict import settings_of_results
-from pipelines.stages.reading import FrameReader
+from pipelines.stages.reading import FrameReader, ReadsAhead
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
 
 
 @dataclass
-class Score:
+class Score(ReadsAhead):
     """Scores the labels of a frame with one source.
 
     Attributes:
@@ -59,26 +59,15 @@ class Score:
     source: str
     thresholds: Mapping[str, float]
 
+    def __post_init__(self) -> None:
+        place = segmenter_place(self.config) if PRIORS.takes(self.source, "segmenter") else None
+        self.exclusive = place is not None and place.exclusive
+
     def open(self) -> None:
         """Open the data set, the source and its models."""
         self.dataset = open_dataset(self.config)
         self.read = FrameReader(self._read)
         self.prior = open_prior(self.config, self.source, self.thresholds)
-
-    @property
-    def exclusive(self) -> bool:
-        """Whether the segmenter runs on a device that workers should not share."""
-        place = segmenter_place(self.config) if PRIORS.takes(self.source, "segmenter") else None
-        return place is not None and place.exclusive
-
-    @property
-    def workers(self) -> int | None:
-        """How many workers run the segmenter at the same time."""
-        return 1 if self.exclusive else None
-
-    def prefetch(self, jobs: Sequence[FrameJob]) -> None:
-        """Begin to read the frames of the next call."""
-        self.read.announce(job.frame for job in jobs)
 
     def _read(self, frame_id: str) -> Frame:
         """Return what the source needs of a frame."""
@@ -101,7 +90,8 @@ class Score:
 class Rescore(Score):
     """Scores the labels of a frame from stored measurements."""
 
-    exclusive = False
+    def __post_init__(self) -> None:
+        self.exclusive = False
 
     def open(self) -> None:
         """Open the source alone, without data set and segmenter."""

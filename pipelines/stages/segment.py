@@ -7,6 +7,7 @@ workers, and no later round, audit or workspace makes them again.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from pipelines.assembly import (
@@ -16,15 +17,17 @@ from pipelines.assembly import (
     open_map_store,
     open_segmenter,
 )
+from pipelines.devices import segmenter_place
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext
+from pipelines.stages.reading import FrameReader, ReadsAhead
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset
 
 
 @dataclass
-class Segment:
+class Segment(ReadsAhead):
     """Makes and stores the maps of a frame.
 
     Attributes:
@@ -33,14 +36,18 @@ class Segment:
 
     config: Config
 
+    def __post_init__(self) -> None:
+        place = segmenter_place(self.config)
+        self.exclusive = place is not None and place.exclusive
+
     def open(self) -> None:
         """Open the data set and the segmenter."""
-        self.dataset = open_dataset(self.config)
+        self.read = FrameReader(partial(open_dataset(self.config).read, points=False))
         self.segmenter = open_segmenter(self.config)
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Store the map of each camera's image; there are no rows."""
-        for view in self.dataset.read(job.frame, points=False).views():
+        for view in self.read(job.frame).views():
             self.segmenter.segment(view)
         return {}
 

@@ -10,10 +10,12 @@ from support.tiny_onnx import tiny_detector
 
 from curate.detectors.devices import check_device_name, choose_device
 from curate.errors import ConfigError, DataError
-from pipelines.assembly import check_detector, check_segmenter, open_detector
+from pipelines.assembly import check_detector, check_segmenter, made_by, open_detector
 from pipelines.devices import ModelPlace, detector_place, idle_gpu, segmenter_place
 from pipelines.stages.predict import settings_of_results
 from pipelines.stages.reading import FrameReader
+from pipelines.stages.score import Score
+from pipelines.stages.segment import Segment
 from pipelines.stages.train_round import loaders
 from pipelines.workspace.config import make_config
 
@@ -140,6 +142,24 @@ def test_results_of_another_device_or_provider_stay_valid():
     other = {"provider_options": {"tensorrt": {"trt_fp16_enable": True}}}
     assert settings_of_results(config(detector=other).detector) != first
     assert not {"providers", "provider_options"} & first.keys()
+
+
+def test_stored_maps_depend_on_the_options_of_providers_alone():
+    """TensorRT's half precision gives other maps; another provider gives the same."""
+    simulated = {"name": "simulated"}
+    first = made_by(config(segmenter=simulated))
+    assert made_by(config(segmenter={**simulated, "providers": "cpu"})) == first
+    other = {**simulated, "provider_options": {"tensorrt": {"trt_fp16_enable": True}}}
+    assert made_by(config(segmenter=other)) != first
+
+
+@pytest.mark.parametrize("kind", [Segment, lambda each: Score(each, "semantic", {})])
+def test_workers_do_not_share_the_gpu_of_a_segmenter(kind, monkeypatch):
+    section = {"name": "simulated", "providers": "cpu"}
+    assert kind(config(segmenter=section)).workers is None
+    fake_providers(monkeypatch, FakeRuntime(("CUDA",)))
+    gpu = kind(config(segmenter={**section, "providers": "cuda"}))
+    assert (gpu.exclusive, gpu.workers) == (True, 1)
 
 
 def test_an_idle_gpu_is_noticed(monkeypatch):
