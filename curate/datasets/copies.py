@@ -154,9 +154,9 @@ class _Copies:
         return folder / f"{frame_id}{suffix}"
 
     def _calibrated(self, frame: Frame) -> Frame:
-        """Return a frame with the calibrations of its copy."""
-        similarity = self._copies[frame.frame_id]
-        return frame if similarity is None else augmented_frame(frame, similarity)
+        """Return a frame with the calibrations of its copy, without points."""
+        similarity = self._copies[frame.frame_id] or Similarity()
+        return augmented_frame(frame.with_points(frame.points[:0]), similarity)
 
     def _write_points(self, target: Path, frame: Frame) -> None:
         """Write the points of a frame's copy."""
