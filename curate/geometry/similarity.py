@@ -66,7 +66,12 @@ class Similarity:
     def apply_to_points(self, points: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """Return A of (n, >=3) points, in the same dtype; further columns stay unchanged."""
         moved = points.copy()
-        moved[:, :3] = points[:, :3] @ self._matrix().T.astype(points.dtype)
+        matrix = self._matrix().astype(points.dtype)
+        # Column by column: a matrix product would wake all threads of BLAS for a millisecond of
+        # work, and would round a point differently in another selection of points.
+        moved[:, 0] = matrix[0, 0] * points[:, 0] + matrix[0, 1] * points[:, 1]
+        moved[:, 1] = matrix[1, 0] * points[:, 0] + matrix[1, 1] * points[:, 1]
+        moved[:, 2] *= matrix[2, 2]
         return moved
 
     def apply_to_boxes(self, boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 7"]:

@@ -77,3 +77,13 @@ def test_invalid_values_are_rejected(wrong: dict) -> None:
     """With their values in the message."""
     with pytest.raises(ConfigError, match=r"copies (of|with)"):
         AugmentedViews(**wrong)
+
+
+def test_a_point_is_rounded_alike_in_any_selection() -> None:
+    """So that a detector elsewhere, which crops the copy, sees the very numbers of repredict."""
+    points = np.random.default_rng(0).uniform(-70, 70, (1000, 4)).astype(np.float32)
+    similarity = Similarity(True, 0.7, 1.03)
+    chosen = np.flatnonzero(points[:, 0] > 3)
+    np.testing.assert_array_equal(
+        similarity.apply_to_points(points)[chosen], similarity.apply_to_points(points[chosen])
+    )
