@@ -198,6 +198,9 @@ class CommandDetector:
                 except CurateError as error:
                     found[frame_id] = error
             written = [frame_id for frame_id in writer.frame_ids if frame_id not in found]
+            if found and written:  # the lists must not have frames without files
+                given = {frame_id: copies[frame_id] for frame_id in written}
+                copy_writer(self._dataset, data, given, camera_view=self._camera_view).prepare()
             frames.write_text("".join(f"{frame_id}\n" for frame_id in written))
         except OSError as error:
             raise DataError(

@@ -156,10 +156,16 @@ def test_frames_without_a_result_fail_alone(root: Path, tmp_path: Path, script: 
 
 
 def test_a_frame_that_cannot_be_read_fails_alone(tmp_path: Path, script: Path) -> None:
-    """The others are given to the command, and nothing is kept."""
+    """The others are given to the command, without it in any list, and nothing is kept."""
     write_toy_kitti(tmp_path / "data", frames=3)
     (tmp_path / "data" / "training" / "velodyne" / "000001.bin").write_bytes(b"damaged")
-    made = detector(tmp_path / "data", tmp_path, command_of(script))
+    lists = _script(
+        tmp_path,
+        f'diff "$3" "$2/../data/ImageSets/test.txt" || exit 1\n{command_of(script)}'.replace(
+            "{clouds}", '"$1"'
+        ).replace("{results}", '"$2"'),
+    )
+    made = detector(tmp_path / "data", tmp_path, f"sh {lists} {{clouds}} {{results}} {{frames}}")
     found = made.predict_copies(dict.fromkeys(FRAMES[:3]))
     assert [type(each) for each in found] == [Detections, DataError, Detections]
     assert list((tmp_path / "batches").iterdir()) == []
