@@ -120,9 +120,9 @@ def _visible_fractions(
 ) -> np.ndarray:
     """Return (n,) the visible fraction of each object's pixels in the image.
 
-    The pixels are a grid in the object's 2D box. Where the object is not visible, rays are cast into
-    a scene of the actors alone, with all hits along each ray: an object covers the pixels with a
-    hit on it, visible or not.
+    The pixels are a grid in the object's 2D box. Where the object is not visible, rays are cast
+    into a scene of the actors alone, with all hits along each ray: an object covers the pixels with
+    a hit on it, visible or not.
     """
     actors = np.isin(scene.instances, numbers)
     rows = np.flatnonzero(actors)
