@@ -18,7 +18,7 @@ has a higher score. Result 0 then has no label left: it is a false positive. Res
 `true_positive_scores` returns [0.9, 0.4]: there A takes 0, which has the highest score.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
@@ -26,7 +26,8 @@ import numpy as np
 from numba import njit
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects
-from curate.geometry.overlap import overlapping_pairs
+from curate.evaluation.kitti_rules import COUNTED
+from curate.geometry.overlap import overlapping_pairs, pairs_within_groups
 from curate.shapes import Bool, Float, Int, Shaped
 
 METRICS = ("image", "bev", "3d")
@@ -84,12 +85,15 @@ class MatchInputs(NamedTuple):
         result_states: (results,) int8, as for the labels.
         scores: (results,) float64.
         min_overlap: only pairs with an overlap above this can match.
+        by_score: whether a label takes the free result with the highest score, not that with the
+            greatest overlap.
     """
 
     label_states: np.ndarray
     result_states: np.ndarray
     scores: np.ndarray
     min_overlap: float
+    by_score: bool = False
 
 
 def candidates_by_metric(
@@ -112,18 +116,21 @@ def candidates_by_metric(
     }
     if not in_image:
         return found
-    on_image = _image_pairs(
-        labels.objects.boxes_2d, labels.starts, results.objects.boxes_2d, results.starts
-    )
-    return {"image": _by_label(count, *on_image), **found}
+    parts = [
+        (rows, columns, common / (areas_a + areas_b - common))
+        for rows, columns, common, areas_a, areas_b in _common_pixels(labels, results)
+    ]
+    rows, columns, overlaps = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return {"image": _by_label(count, rows, columns, overlaps), **found}
 
 
 def dont_care_shares(labels: PooledFrames, results: PooledFrames) -> Float[np.ndarray, " results"]:
     """Return (results,) the largest share of each 2D box that lies in one DontCare region."""
     regions = labels.select(labels.objects.categories == DONT_CARE)
-    return _covered_shares(
-        regions.objects.boxes_2d, regions.starts, results.objects.boxes_2d, results.starts
-    )
+    shares = np.zeros(len(results.objects))
+    for _, columns, common, _, areas in _common_pixels(regions, results):
+        np.maximum.at(shares, columns, common / areas)
+    return shares
 
 
 def camera_boxes(objects: KittiObjects) -> Float[np.ndarray, "n 7"]:
@@ -176,121 +183,96 @@ def _by_label(
     return Candidates(starts, columns[overlapping], overlaps[overlapping])
 
 
-@njit(cache=True, nogil=True)
-def _common_pixels(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-    """Return the intersection area of two 2D boxes (left, top, right, bottom)."""
-    width = min(a[i, 2], b[j, 2]) - max(a[i, 0], b[j, 0])
-    height = min(a[i, 3], b[j, 3]) - max(a[i, 1], b[j, 1])
-    return width * height if width > 0 and height > 0 else 0.0
+def _common_pixels(
+    a: PooledFrames, b: PooledFrames
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the pairs of 2D boxes that intersect within a frame, in blocks, ascending by row.
+
+    Each block has the row in a, the row in b, the area of the intersection, and those of both
+    boxes.
+    """
+    boxes_a, boxes_b = a.objects.boxes_2d, b.objects.boxes_2d
+    areas_a, areas_b = (
+        np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) for boxes in (boxes_a, boxes_b)
+    )
+    for rows, columns in pairs_within_groups(a.starts, b.starts):
+        of_a, of_b = boxes_a[rows], boxes_b[columns]
+        sides = np.minimum(of_a[:, 2:], of_b[:, 2:]) - np.maximum(of_a[:, :2], of_b[:, :2])
+        common = np.flatnonzero((sides > 0).all(axis=1))
+        in_a, in_b = rows[common], columns[common]
+        yield in_a, in_b, np.prod(sides[common], axis=1), areas_a[in_a], areas_b[in_b]
 
 
-@njit(cache=True, nogil=True)
-def _pixels(boxes: np.ndarray, i: int) -> float:
-    """Return the area of a 2D box."""
-    return float((boxes[i, 2] - boxes[i, 0]) * (boxes[i, 3] - boxes[i, 1]))
-
-
-@njit(cache=True, nogil=True)
-def _image_pairs(
-    a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return row in a, row in b and IoU of the 2D boxes that overlap in a frame, in this order."""
-    # numba infers the type of an empty list from the elements of the comprehension.
-    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]
-    overlaps = [0.0 for _ in range(0)]
-    for frame in range(len(starts_a) - 1):
-        for i in range(starts_a[frame], starts_a[frame + 1]):
-            for j in range(starts_b[frame], starts_b[frame + 1]):
-                common = _common_pixels(a, i, b, j)
-                if common > 0:
-                    rows_a.append(i)
-                    rows_b.append(j)
-                    overlaps.append(common / (_pixels(a, i) + _pixels(b, j) - common))
-    return np.array(rows_a), np.array(rows_b), np.array(overlaps)
-
-
-@njit(cache=True, nogil=True)
-def _covered_shares(
-    regions: np.ndarray, region_starts: np.ndarray, boxes: np.ndarray, starts: np.ndarray
-) -> np.ndarray:
-    """Return the largest share of each box that lies in one region of its frame."""
-    shares = np.zeros(len(boxes))
-    for frame in range(len(starts) - 1):
-        for j in range(starts[frame], starts[frame + 1]):
-            for i in range(region_starts[frame], region_starts[frame + 1]):
-                common = _common_pixels(regions, i, boxes, j)
-                if common > 0:
-                    shares[j] = max(shares[j], common / _pixels(boxes, j))
-    return shares
-
-
-@njit(cache=True, nogil=True)
-def true_positive_scores(candidates: Candidates, inputs: MatchInputs) -> np.ndarray:
+def true_positive_scores(
+    candidates: Candidates, inputs: MatchInputs
+) -> Float[np.ndarray, " true_positives"]:
     """Return the scores of the true positives, in the order of the labels.
 
     Here each label takes the free result with the highest score. KITTI uses this matching to choose
     the score thresholds; it counts with `match_results`.
     """
-    taken = np.zeros(len(inputs.scores), np.bool_)
-    found = np.empty(len(inputs.label_states))
-    number = 0
-    for label in range(len(inputs.label_states)):
-        if inputs.label_states[label] < 0:
-            continue
-        best = -1
-        for pair in range(candidates.starts[label], candidates.starts[label + 1]):
-            row = candidates.results[pair]
-            if (
-                candidates.overlaps[pair] > inputs.min_overlap
-                and inputs.result_states[row] >= 0
-                and not taken[row]
-                and (best < 0 or inputs.scores[row] > inputs.scores[best])
-            ):
-                best = row
-        if best >= 0:
-            taken[best] = True
-            if inputs.label_states[label] == 0 and inputs.result_states[best] == 0:
-                found[number] = inputs.scores[best]
-                number += 1
-    return found[:number]
+    matches = match_results(candidates, inputs._replace(by_score=True), -np.inf)
+    found = matches[(matches >= 0) & (inputs.label_states == COUNTED)]
+    scores: np.ndarray = inputs.scores[found[inputs.result_states[found] == COUNTED]]
+    return scores
 
 
-@njit(cache=True, nogil=True)
-def match_results(candidates: Candidates, inputs: MatchInputs, threshold: float) -> np.ndarray:
+def match_results(
+    candidates: Candidates, inputs: MatchInputs, threshold: float
+) -> Int[np.ndarray, " labels"]:
     """Return (labels,) int64 row of the result that each label takes, -1 for none.
 
     The labels choose one after the other among the results that are still free and have a score of
     at least `threshold`. A label takes the counted result with the greatest overlap, or the first
     ignored result if no counted one overlaps enough.
     """
-    taken = np.zeros(len(inputs.scores), np.bool_)
-    matches = np.full(len(inputs.label_states), -1)
+    taken = np.empty(len(inputs.scores), dtype=bool)
+    matches = np.empty(len(inputs.label_states), dtype=np.int64)
+    fill_matches(candidates, inputs, threshold, taken, matches)
+    return matches
+
+
+# The kernels write into arrays that the caller has made: the compilation of np.zeros and its like
+# would take longer than that of the loops.
+@njit(cache=True, nogil=True)
+def fill_matches(
+    candidates: Candidates,
+    inputs: MatchInputs,
+    threshold: float,
+    taken: np.ndarray,
+    matches: np.ndarray,
+) -> None:
+    """Write the matches of `match_results`; `taken` (results,) bool has any content before."""
+    for row in range(len(taken)):
+        taken[row] = False
     for label in range(len(inputs.label_states)):
-        if inputs.label_states[label] < 0:
-            continue
+        matches[label] = -1
         best, best_overlap = -1, 0.0
         for pair in range(candidates.starts[label], candidates.starts[label + 1]):
             row, overlap = candidates.results[pair], candidates.overlaps[pair]
-            if overlap <= inputs.min_overlap or taken[row] or inputs.scores[row] < threshold:
+            state = inputs.result_states[row]
+            absent = inputs.label_states[label] < 0 or overlap <= inputs.min_overlap
+            if absent or taken[row] or inputs.scores[row] < threshold:
                 continue
-            if inputs.result_states[row] == 0 and overlap > best_overlap:
+            if inputs.by_score:
+                if state >= 0 and (best < 0 or inputs.scores[row] > inputs.scores[best]):
+                    best = row
+            elif state == 0 and overlap > best_overlap:
                 best, best_overlap = row, overlap
-            elif inputs.result_states[row] == 1 and best < 0:
+            elif state == 1 and best < 0:
                 best = row
         if best >= 0:
             taken[best] = True
             matches[label] = best
-    return matches
 
 
-@njit(cache=True, nogil=True)
 def count_at_thresholds(
     candidates: Candidates,
     inputs: MatchInputs,
     thresholds: np.ndarray,
     in_dont_care: np.ndarray,
     orientation_gains: np.ndarray,
-) -> np.ndarray:
+) -> Float[np.ndarray, "t 3"]:
     """Count true and false positives at each score threshold.
 
     Args:
@@ -304,8 +286,27 @@ def count_at_thresholds(
         (t, 3) true positives, false positives, sum of the orientation gains.
     """
     totals = np.zeros((len(thresholds), 3))
+    taken = np.empty(len(inputs.scores), dtype=bool)
+    matches = np.empty(len(inputs.label_states), dtype=np.int64)
+    work = (taken, matches)
+    add_counts(candidates, inputs, thresholds, in_dont_care, orientation_gains, work, totals)
+    return totals
+
+
+@njit(cache=True, nogil=True)
+def add_counts(
+    candidates: Candidates,
+    inputs: MatchInputs,
+    thresholds: np.ndarray,
+    in_dont_care: np.ndarray,
+    orientation_gains: np.ndarray,
+    work: tuple[np.ndarray, np.ndarray],
+    totals: np.ndarray,
+) -> None:
+    """Add the counts of `count_at_thresholds` to (t, 3) totals."""
+    taken, matches = work
     for position in range(len(thresholds)):
-        matches = match_results(candidates, inputs, thresholds[position])
+        fill_matches(candidates, inputs, thresholds[position], taken, matches)
         for row in range(len(inputs.scores)):
             if (
                 inputs.result_states[row] == 0
@@ -324,4 +325,3 @@ def count_at_thresholds(
                 for pair in range(candidates.starts[label], candidates.starts[label + 1]):
                     if candidates.results[pair] == row:
                         totals[position, 2] += orientation_gains[pair]
-    return totals

@@ -1,6 +1,7 @@
 """Height of the ground in a sweep, accurate to a few centimetres."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -35,28 +36,15 @@ class GroundMap:
         and cars that cover the other squares therefore do not raise the height, and a single
         outlier does not lower it.
         """
-        near = points[(np.abs(points[:, :2]) <= _REACH_METRES).all(axis=1), :3]
-        if len(near) == 0:
-            return cls(np.zeros(2), np.full((1, 1), np.nan))
-        low = near[:, :2].min(axis=0).astype(np.float64) - _SQUARE_METRES
-        square = ((near[:, :2] - low) / _SQUARE_METRES).astype(np.int64)
-        columns, rows = square.max(axis=0) + 2
-        lowest = np.full(columns * rows, np.inf)
-        np.minimum.at(lowest, square[:, 0] * rows + square[:, 1], near[:, 2])
-        padded = np.pad(lowest.reshape(columns, rows), 1, constant_values=np.inf)
-        around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(columns, rows, 9)
-        first, second = np.moveaxis(np.partition(around, 1, axis=-1)[..., :2], -1, 0)
-        heights = np.where(np.isinf(second), first, second)
-        return cls(low, np.where(np.isinf(heights), np.nan, heights))
+        from curate.geometry.ground_kernels import ground_heights
+
+        # In one type, so that the kernels are compiled only once.
+        coordinates = np.ascontiguousarray(points[:, :3], dtype=np.float64)
+        return cls(*ground_heights(coordinates, _REACH_METRES, _SQUARE_METRES))
 
     def at(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
         """Return (n,) height of the ground at (n, 2) places x, y; NaN if it is not known there."""
-        reach = 2 * _REACH_METRES
-        offset = np.clip(places, -reach, reach) - self.low
-        square = np.floor(offset / _SQUARE_METRES).astype(np.int64)
-        on_map = ((square >= 0) & (square < self.heights.shape)).all(axis=1)
-        column, row = np.where(on_map[:, None], square, 0).T
-        return np.where(on_map, self.heights[column, row], np.nan)
+        return self._heights(places)
 
     def lowered(self, rows: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
         """Return a copy of (n, >=3) points or boxes with z measured from the ground below them.
@@ -70,9 +58,20 @@ class GroundMap:
         return self._shift(rows, 1)
 
     def _shift(self, rows: np.ndarray, sign: int) -> np.ndarray:
-        heights = self.at(rows[:, :2])
-        valid = self.heights[~np.isnan(self.heights)]
-        median = np.median(valid) if len(valid) else 0.0
+        heights = self._heights(rows)
         shifted = rows.copy()
-        shifted[:, 2] += sign * np.where(np.isnan(heights), median, heights)
+        shifted[:, 2] += sign * np.where(np.isnan(heights), self._median, heights)
         return shifted
+
+    def _heights(self, rows: np.ndarray) -> np.ndarray:
+        from curate.geometry.ground_kernels import heights_at
+
+        places = np.ascontiguousarray(rows[:, :2], dtype=np.float64)
+        found: np.ndarray = heights_at(places, self.low, self.heights, _SQUARE_METRES)
+        return found
+
+    @cached_property
+    def _median(self) -> float:
+        """Median height of the map; 0 if no height is known."""
+        valid = self.heights[~np.isnan(self.heights)]
+        return float(np.median(valid)) if len(valid) else 0.0

@@ -18,9 +18,14 @@ There is no division by a difference that can vanish, so touching, nested and ne
 rectangles need no special case. For exactly aligned rectangles the area is the product of the
 common sides: a box has an IoU of exactly 1 with itself.
 
+The first kernels write into arrays that the caller has made: compiling np.zeros would take longer
+than compiling the loops.
+
 All kernels are in this one file because numba's cache on disk tracks changes only of the file of a
 kernel: a kernel in another file would keep using an old version of the functions here.
 """
+
+import math
 
 import numpy as np
 from numba import njit
@@ -30,31 +35,33 @@ from numba import njit
 # product of the sides.
 _ALIGNED_SINE = 1e-12
 
-# Columns of the table that `rectangle_table` returns.
+# Columns of the table that `fill_rectangle_table` fills.
 _X, _Y, _Z, _HALF_LENGTH, _HALF_WIDTH, _HALF_HEIGHT, _COS, _SIN, _RADIUS, _AREA = range(10)
 
 _Pair = tuple[float, float]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def rectangle_table(boxes: np.ndarray) -> np.ndarray:
-    """Return the (n, 10) table of (n, 7) boxes with the values that the other kernels use.
+def fill_rectangle_table(boxes: np.ndarray, table: np.ndarray) -> None:
+    """Fill the (n, 10) table of (n, 7) boxes with the values that the other kernels use.
 
     A box with a length or width that is not positive gets area 0, and a box with a number that is
     not finite gets a row of zeros: such boxes overlap nothing.
+
+    Args:
+        boxes: (n, 7).
+        table: (n, 10) zeros.
     """
-    table = np.zeros((len(boxes), 10))
     for i in range(len(boxes)):
-        if not np.isfinite(boxes[i].sum()):
+        x, y, z, length, width, height, yaw = boxes[i]
+        if not math.isfinite(x + y + z + length + width + height + yaw):
             continue
-        length, width, height = boxes[i, 3], boxes[i, 4], boxes[i, 5]
-        table[i, _X], table[i, _Y], table[i, _Z] = boxes[i, 0], boxes[i, 1], boxes[i, 2]
+        table[i, _X], table[i, _Y], table[i, _Z] = x, y, z
         table[i, _HALF_LENGTH], table[i, _HALF_WIDTH] = length / 2, width / 2
         table[i, _HALF_HEIGHT] = height / 2
-        table[i, _COS], table[i, _SIN] = np.cos(boxes[i, 6]), np.sin(boxes[i, 6])
-        table[i, _RADIUS] = np.hypot(length, width) / 2
+        table[i, _COS], table[i, _SIN] = math.cos(yaw), math.sin(yaw)
+        table[i, _RADIUS] = math.hypot(length, width) / 2
         table[i, _AREA] = length * width if length > 0 and width > 0 else 0.0
-    return table
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -202,43 +209,24 @@ def iou_matrix(a: np.ndarray, b: np.ndarray, order: np.ndarray, with_height: boo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def paired_iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return (n,) 3D IoU of row i of the (n, 10) rectangle table a with row i of b."""
-    overlaps = np.zeros(len(a))
-    for i in range(len(a)):
-        if _near(a, i, b, i):
-            overlaps[i] = _iou_3d(a, i, b, i)
-    return overlaps
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def grouped_iou(
-    a: np.ndarray, starts_a: np.ndarray, b: np.ndarray, starts_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs that overlap in bird's eye view, within each group.
+def fill_pair_ious(
+    a: np.ndarray, rows_a: np.ndarray, b: np.ndarray, rows_b: np.ndarray, ious: np.ndarray
+) -> None:
+    """Write the BEV IoU and the 3D IoU of pairs of rows of the rectangle tables a and b.
 
     Args:
-        a: (n, 10) rectangle table; group g is rows starts_a[g] to starts_a[g + 1].
-        starts_a: (groups + 1,) int64.
-        b: (m, 10) rectangle table; group g is rows starts_b[g] to starts_b[g + 1].
-        starts_b: (groups + 1,) int64.
-
-    Returns:
-        Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
+        a: (n, 10) rectangle table.
+        rows_a: (pairs,) int64 rows of a.
+        b: (m, 10) rectangle table.
+        rows_b: (pairs,) int64 rows of b.
+        ious: (2, pairs) zeros.
     """
-    # Empty lists; numba infers the type of a list from the element in the comprehension.
-    rows_a, rows_b = [0 for _ in range(0)], [0 for _ in range(0)]
-    bev, volumes = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
-    for group in range(len(starts_a) - 1):
-        for i in range(starts_a[group], starts_a[group + 1]):
-            for j in range(starts_b[group], starts_b[group + 1]):
-                overlap = _bev_iou(a, i, b, j) if _near(a, i, b, j) else 0.0
-                if overlap > 0:
-                    rows_a.append(i)
-                    rows_b.append(j)
-                    bev.append(overlap)
-                    volumes.append(_iou_3d(a, i, b, j))
-    return np.array(rows_a), np.array(rows_b), np.array(bev), np.array(volumes)
+    for k in range(len(rows_a)):
+        i, j = rows_a[k], rows_b[k]
+        if _near(a, i, b, j):
+            ious[0, k] = _bev_iou(a, i, b, j)
+            if ious[0, k] > 0:
+                ious[1, k] = _iou_3d(a, i, b, j)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

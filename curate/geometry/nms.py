@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from curate.geometry.boxes import as_boxes
+from curate.geometry.overlap import rectangle_table
 from curate.shapes import Int, Num
 
 
@@ -22,7 +22,7 @@ def nms_bev(
     Returns:
         (k,) int64 indices of the kept boxes, by descending score.
     """
-    from curate.geometry.kernels import greedy_nms, rectangle_table
+    from curate.geometry.kernels import greedy_nms
 
     order = np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable")
-    return greedy_nms(rectangle_table(as_boxes(boxes)), order, float(iou_threshold))
+    return greedy_nms(rectangle_table(boxes), order, float(iou_threshold))

@@ -5,10 +5,16 @@ by 180 degrees. The order of the two arguments does not matter. A box with a sid
 negative or not finite overlaps nothing, not even itself.
 """
 
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Final
+
 import numpy as np
 
 from curate.geometry.boxes import as_boxes
 from curate.shapes import Float, Int, Num
+
+_BLOCK: Final = 1 << 20  # pairs that are tested at a time: bounds the memory
 
 
 def bev_iou(
@@ -53,9 +59,11 @@ def paired_iou_3d(
     Raises:
         ValueError: if boxes are not rows of seven numbers.
     """
-    from curate.geometry.kernels import paired_iou
-
-    return paired_iou(_table(boxes_a), _table(boxes_b))
+    rows = np.arange(len(boxes_a))
+    volumes: np.ndarray = _pair_ious(
+        rectangle_table(boxes_a), rows, rectangle_table(boxes_b), rows
+    )[1]
+    return volumes
 
 
 def overlapping_pairs(
@@ -80,22 +88,60 @@ def overlapping_pairs(
     Returns:
         Row in a, row in b, BEV IoU and 3D IoU of each pair, ascending by (row in a, row in b).
     """
-    from curate.geometry.kernels import grouped_iou
+    table_a, table_b = rectangle_table(boxes_a), rectangle_table(boxes_b)
+    parts: list[tuple[np.ndarray, ...]] = []
+    for rows_a, rows_b in pairs_within_groups(starts_a, starts_b):
+        bev, volumes = _pair_ious(table_a, rows_a, table_b, rows_b)
+        overlapping = np.flatnonzero(bev)
+        found = (rows_a, rows_b, bev, volumes)
+        parts.append(tuple(values[overlapping] for values in found))
+    rows_a, rows_b, bev, volumes = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return rows_a, rows_b, bev, volumes
 
-    groups_a = np.ascontiguousarray(starts_a, dtype=np.int64)
-    groups_b = np.ascontiguousarray(starts_b, dtype=np.int64)
-    return grouped_iou(_table(boxes_a), groups_a, _table(boxes_b), groups_b)
+
+def pairs_within_groups(
+    starts_a: Int[np.ndarray, " groups_plus_1"], starts_b: Int[np.ndarray, " groups_plus_1"]
+) -> Iterator[tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]]:
+    """Yield the row in a and the row in b of all pairs within groups, in one block or more.
+
+    The pairs are ascending by (row in a, row in b). The arguments are those of `overlapping_pairs`.
+    """
+    sizes_a, sizes_b = np.diff(starts_a), np.diff(starts_b)
+    partners, first = np.repeat(sizes_b, sizes_a), np.repeat(starts_b[:-1], sizes_a)
+    ends = np.cumsum(partners)
+    total = int(ends[-1]) if len(ends) else 0
+    limits = np.searchsorted(ends, np.arange(0, max(total, 1), _BLOCK), side="right")
+    for low, high in pairwise([*limits.tolist(), len(ends)]):
+        rows_a = np.repeat(np.arange(low, high), partners[low:high])
+        before = np.repeat(ends[low:high] - partners[low:high], partners[low:high])
+        position = np.arange(len(rows_a)) + (ends[low] - partners[low] if low < high else 0)
+        yield rows_a, first[rows_a] + position - before
+
+
+def rectangle_table(boxes: Num[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 10"]:
+    """Return the table of boxes with the values that the kernels use."""
+    from curate.geometry.kernels import fill_rectangle_table
+
+    boxes = as_boxes(boxes)
+    table = np.zeros((len(boxes), 10))
+    fill_rectangle_table(boxes, table)
+    return table
 
 
 def _iou(boxes_a: np.ndarray, boxes_b: np.ndarray, *, with_height: bool) -> np.ndarray:
     from curate.geometry.kernels import iou_matrix
 
-    table_b = _table(boxes_b)
+    table_b = rectangle_table(boxes_b)
     order = np.argsort(table_b[:, 0])
-    return iou_matrix(_table(boxes_a), table_b[order], order, with_height)
+    return iou_matrix(rectangle_table(boxes_a), table_b[order], order, with_height)
 
 
-def _table(boxes: np.ndarray) -> np.ndarray:
-    from curate.geometry.kernels import rectangle_table
+def _pair_ious(
+    table_a: np.ndarray, rows_a: np.ndarray, table_b: np.ndarray, rows_b: np.ndarray
+) -> np.ndarray:
+    """Return (2, pairs) BEV IoU and 3D IoU of pairs of rows of two rectangle tables."""
+    from curate.geometry.kernels import fill_pair_ious
 
-    return rectangle_table(as_boxes(boxes))
+    ious = np.zeros((2, len(rows_a)))
+    fill_pair_ious(table_a, rows_a, table_b, rows_b, ious)
+    return ious

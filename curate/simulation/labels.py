@@ -120,8 +120,9 @@ def _visible_fractions(
 ) -> np.ndarray:
     """Return (n,) the visible fraction of each object's pixels in the image.
 
-    Rays through a grid of pixels in the object's 2D box are cast into a scene of the actors alone,
-    with all hits along each ray. An object covers the pixels with a hit on it, visible or not.
+    The pixels are a grid in the object's 2D box. Where the object is not visible, rays are cast
+    into a scene of the actors alone, with all hits along each ray: an object covers the pixels with
+    a hit on it, visible or not.
     """
     actors = np.isin(scene.instances, numbers)
     rows = np.flatnonzero(actors)
@@ -129,12 +130,14 @@ def _visible_fractions(
     pixels = [_probe_pixels(box_2d) for box_2d in boxes_2d]
     owner = np.repeat(numbers, [len(part) for part in pixels])
     pixel = np.concatenate(pixels)
-    ray, triangle = alone.all_hits(rig.rays(pixel))
-    covered = np.zeros(len(pixel), dtype=bool)
-    covered[ray[scene.instances[rows[triangle]] == owner[ray]]] = True
     visible = view.instances.ravel()[pixel] == owner
+    elsewhere = np.flatnonzero(~visible)
+    ray, triangle = alone.all_hits(rig.rays(pixel[elsewhere]))
+    covered = visible.copy()
+    hit = elsewhere[ray]
+    covered[hit[scene.instances[rows[triangle]] == owner[hit]]] = True
     size = int(max(numbers)) + 1
-    covered_count = np.bincount(owner[covered | visible], minlength=size)
+    covered_count = np.bincount(owner[covered], minlength=size)
     visible_count = np.bincount(owner[visible], minlength=size)
     return np.asarray(visible_count[numbers] / np.maximum(covered_count[numbers], 1))
 

@@ -178,17 +178,20 @@ def _simulate_frame(home: Path, seed: int, index: int) -> None:
     view = render(scene, caster, rig, lens)
     annotations = annotate(scene, view, rig)
     replace_file(_frame_file(home, "velodyne", index), points.astype("<f4").tobytes())
-    replace_file(_frame_file(home, "image_2", index), _png(view.image[..., ::-1]))
-    replace_file(_frame_file(home, SEMANTIC_FOLDER, index), _png(view.semantic))
+    # The grain of the image leaves no repetitions: looking for them takes time and saves nothing.
+    image = _png(view.image[..., ::-1], cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
+    replace_file(_frame_file(home, "image_2", index), image)
+    semantic = _png(view.semantic, cv2.IMWRITE_PNG_STRATEGY_RLE)
+    replace_file(_frame_file(home, SEMANTIC_FOLDER, index), semantic)
     replace_file(_frame_file(home, "calib", index), rig.kitti_text().encode())
     write_objects(
         _frame_file(home, "label_2", index), from_annotations(annotations, rig.calibration)
     )
 
 
-def _png(pixels: np.ndarray) -> bytes:
+def _png(pixels: np.ndarray, strategy: int) -> bytes:
     """Encode grey or BGR pixels as PNG; OpenCV's default compression level is the fast one."""
-    _, encoded = cv2.imencode(".png", pixels)
+    _, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_STRATEGY, strategy])
     return bytes(encoded)
 
 

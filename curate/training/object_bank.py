@@ -98,7 +98,7 @@ def paste_objects(
     drawn = bank.draw(_TRIES * count, generator)
     if not drawn or len(sample.points) == 0:
         return sample
-    scene = _Scene(sample.points)
+    scene = _Scene(sample.points, sum(len(candidate.points) for candidate in drawn))
     rotations = _rotations(drawn, scene.azimuths, generator)
     boxes = np.concatenate(
         [
@@ -165,26 +165,41 @@ class _Outlines:
             (boxes[:, 2] - boxes[:, 5] / 2 + _GROUND_METRES) / nearest,
         )
 
-    def cover(self, rows: list[int], points: "_SensorView") -> np.ndarray:
-        """Return (p,) bool: whether a point is inside one of these outlines, at any distance."""
+    def cover(self, rows: list[int], view: np.ndarray) -> np.ndarray:
+        """Return (p,) bool: whether a point is inside one of these outlines, at any distance.
+
+        Args:
+            rows: rows of the outlines.
+            view: (3, p) points, see `_sensor_view`.
+        """
         within = [
-            (values >= bounds[rows, :1].T) & (values <= bounds[rows, 1:].T)
-            for values, bounds in (
-                (points.azimuth[:, None], self.azimuth),
-                (points.slope[:, None], self.slope),
-            )
+            (values[:, None] >= bounds[rows, 0]) & (values[:, None] <= bounds[rows, 1])
+            for values, bounds in ((view[0], self.azimuth), (view[1], self.slope))
         ]
         return np.asarray((within[0] & within[1]).any(axis=1))
 
+    def row(self, k: int) -> np.ndarray:
+        """Return the outline of box k in the form of the kernel `hide_behind`."""
+        return np.array([*self.azimuth[k], *self.slope[k], self.distance[k], self.above_ground[k]])
+
 
 class _Scene:
-    """The points of a frame from the sensor's view; pasted objects hide points behind them."""
+    """The points of a frame from the sensor's view; pasted objects hide points behind them.
 
-    def __init__(self, points: np.ndarray) -> None:
-        self._points, self._view = points, _SensorView.of(points)
-        self._visible = np.ones(len(points), dtype=bool)
+    Args:
+        points: (n, 4) points of the frame.
+        more: highest number of points that are pasted.
+    """
+
+    def __init__(self, points: np.ndarray, more: int) -> None:
+        self._count = len(points)
+        self._points = np.empty((self._count + more, points.shape[1]), dtype=points.dtype)
+        self._view = np.empty((3, len(self._points)), dtype=points.dtype)
+        self._visible = np.zeros(len(self._points), dtype=bool)
+        self._points[: self._count], self._visible[: self._count] = points, True
+        self._view[:, : self._count] = _sensor_view(points)
         self._pasted: list[int] = []
-        azimuth = self._view.azimuth
+        azimuth = self._view[0, : self._count]
         self.azimuths = (float(azimuth.min()), float(azimuth.max()))
 
     def insert(self, outlines: _Outlines, k: int, points: np.ndarray) -> bool:
@@ -195,24 +210,21 @@ class _Scene:
             k: row of the object in the outlines.
             points: (n, 4) points of the object at its new place.
         """
+        from curate.training.occlusion_kernel import hide_behind
+
         low, high = outlines.azimuth[k]
         if low < self.azimuths[0] or high > self.azimuths[1]:
             return False
-        azimuth = self._view.azimuth
-        in_sector = np.flatnonzero((azimuth >= low) & (azimuth <= high) & self._visible)
-        slope, distance = self._view.slope[in_sector], self._view.distance[in_sector]
-        covered = (slope >= outlines.slope[k, 0]) & (slope <= outlines.slope[k, 1])
-        in_front = distance < outlines.distance[k]
-        hiding = covered & in_front & (slope > outlines.above_ground[k])
-        if np.count_nonzero(hiding) > _HIDDEN_SHARE * len(points):
+        # The points that are not pasted yet are not visible, so the kernel skips them.
+        most_in_front = _HIDDEN_SHARE * len(points)
+        if not hide_behind(self._view, self._visible, outlines.row(k), most_in_front):
             return False
-        object_view = _SensorView.of(points)
+        view = _sensor_view(points)
         nearer = [j for j in self._pasted if outlines.distance[j] < outlines.distance[k]]
-        hidden = outlines.cover(nearer, object_view)
-        self._visible[in_sector[covered & ~in_front]] = False
-        self._points = np.concatenate([self._points, points])
-        self._view = self._view.extended(object_view)
-        self._visible = np.concatenate([self._visible, ~hidden])
+        new = slice(self._count, self._count + len(points))
+        self._points[new], self._view[:, new] = points, view
+        self._visible[new] = ~outlines.cover(nearer, view)
+        self._count = new.stop
         self._pasted.append(k)
         return True
 
@@ -221,25 +233,11 @@ class _Scene:
         return self._points[self._visible]
 
 
-@dataclass(frozen=True)
-class _SensorView:
-    """Position of n points in the sensor's view: azimuth, slope and horizontal distance."""
-
-    azimuth: np.ndarray
-    slope: np.ndarray
-    distance: np.ndarray
-
-    @classmethod
-    def of(cls, points: np.ndarray) -> Self:
-        """Return the view of (n, >=3) points."""
-        distance = np.hypot(points[:, 0], points[:, 1])
-        slope = points[:, 2] / np.maximum(distance, 1e-3)
-        return cls(np.arctan2(points[:, 1], points[:, 0]), slope, distance)
-
-    def extended(self, more: Self) -> Self:
-        """Return the view of these points followed by more points."""
-        names = ("azimuth", "slope", "distance")
-        return type(self)(*(np.append(getattr(self, name), getattr(more, name)) for name in names))
+def _sensor_view(points: np.ndarray) -> np.ndarray:
+    """Return (3, n) azimuth, slope and horizontal distance of (n, >=3) points from the sensor."""
+    distance = np.hypot(points[:, 0], points[:, 1])
+    slope = points[:, 2] / np.maximum(distance, 1e-3)
+    return np.stack([np.arctan2(points[:, 1], points[:, 0]), slope, distance])
 
 
 def _occupied(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -322,6 +322,6 @@ def _compare(objects: "ValObjects") -> "KittiEvaluation":
     from curate.geometry.compiled import is_compiled
 
     kitti_ap.check_frames(objects.labels, objects.results)  # before the message below
-    if not is_compiled(kitti_matching.count_at_thresholds):
-        typer.echo("compiling the evaluation code (first use only, about ten seconds)", err=True)
+    if not is_compiled(kitti_matching.add_counts):
+        typer.echo("compiling the evaluation code (first use only, some seconds)", err=True)
     return objects.evaluate()

@@ -110,43 +110,11 @@ def encode_points(points: np.ndarray, preset: Preset) -> Pillars:
         points: in the LiDAR frame, but z measured from the ground (see `GroundMap.lowered`).
         preset: the grid.
     """
-    x, y, z, intensity = (points[:, axis] for axis in range(4))
-    inside = (
-        _within(x, preset.x_range) & _within(y, preset.y_range) & _within(z, preset.height_range)
-    )
-    x, y, z, intensity = x[inside], y[inside], z[inside], intensity[inside]
-    column = ((x - preset.x_range[0]) / preset.pillar_m).astype(np.int64)
-    row = ((y - preset.y_range[0]) / preset.pillar_m).astype(np.int64)
-    # Rounding can move a point just below the upper edge onto the edge.
-    cells_x, cells_y = preset.cells
-    np.minimum(column, 2 * cells_x - 1, out=column)
-    np.minimum(row, 2 * cells_y - 1, out=row)
-    slots = ((column // 2) * cells_y + row // 2) * 4 + (column % 2) * 2 + row % 2
+    from curate.detectors.pillars.encoding_kernels import point_features
 
-    slot_count = 4 * cells_x * cells_y
-    count = np.maximum(np.bincount(slots, minlength=slot_count), 1)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.asarray((np.bincount(slots, values, slot_count) / count)[slots])
-
-    # Distances are in units of a pillar.
-    from_centre_x = x - (preset.x_range[0] + (column + 0.5) * preset.pillar_m)
-    from_centre_y = y - (preset.y_range[0] + (row + 0.5) * preset.pillar_m)
-    features = np.stack(
-        [
-            z,
-            intensity,
-            from_centre_x / preset.pillar_m,
-            from_centre_y / preset.pillar_m,
-            (x - mean(x)) / preset.pillar_m,
-            (y - mean(y)) / preset.pillar_m,
-            z - mean(z),
-            np.log(count[slots]) / 3,
-            np.hypot(x, y) / preset.x_range[1],
-        ],
-        axis=1,
-    )
-    return Pillars(features.astype(np.float32), slots)
+    bounds = np.array([preset.x_range, preset.y_range, preset.height_range])
+    rows = np.ascontiguousarray(points[:, :4], dtype=np.float32)
+    return Pillars(*point_features(rows, bounds, preset.pillar_m, preset.cells, POINT_FEATURES))
 
 
 def encode_boxes(
@@ -162,6 +130,8 @@ def encode_boxes(
         count: number of categories.
         preset: the grid.
     """
+    from curate.detectors.pillars.encoding_kernels import draw_objects
+
     position = (boxes[:, :2] - [preset.x_range[0], preset.y_range[0]]) / preset.cell_m
     cell = np.floor(position).astype(np.int64)
     on_grid = ((cell >= 0) & (cell < preset.cells)).all(axis=1)
@@ -170,7 +140,10 @@ def encode_boxes(
     weights = np.asarray(weights)[on_grid].astype(np.float32)
     heatmap = np.zeros((*preset.cells, count), dtype=np.float32)
     background = np.ones(preset.cells, dtype=np.float32)
-    _draw(heatmap, background, boxes, cell, category_ids, weights, preset.cell_m)
+    sides = boxes[:, 3:5] / preset.cell_m
+    sigmas = np.maximum(sides * _SIGMA_PER_SIDE, _MIN_SIGMA_CELLS)
+    shapes = np.column_stack([sides / 2, sigmas, boxes[:, 6]])
+    draw_objects(heatmap, background, cell, category_ids, weights, shapes, _CUTOFF_SIGMAS)
     rows, code_cells, codes, shares = _box_codes(boxes, position, cell, preset)
     return Targets(
         heatmap,
@@ -251,46 +224,6 @@ def code_ious(
         decode_boxes(codes.astype(np.float64), cells, preset) for codes in (predicted, target)
     )
     return paired_iou_3d(boxes, objects)
-
-
-def _within(values: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:
-    return (values >= bounds[0]) & (values < bounds[1])
-
-
-def _draw(
-    heatmap: np.ndarray,
-    background: np.ndarray,
-    boxes: np.ndarray,
-    cell: np.ndarray,
-    category_ids: np.ndarray,
-    weights: np.ndarray,
-    cell_m: float,
-) -> None:
-    """Draw the objects' gaussians into the heatmap and their regions into the background map."""
-    sides = boxes[:, 3:5] / cell_m
-    sigmas = np.maximum(sides * _SIGMA_PER_SIDE, _MIN_SIGMA_CELLS)
-    for k in range(len(boxes)):
-        reach = int(np.ceil(_CUTOFF_SIGMAS * sigmas[k].max()))
-        window = tuple(
-            slice(
-                max(0, cell[k, axis] - reach),
-                min(background.shape[axis], cell[k, axis] + reach + 1),
-            )
-            for axis in (0, 1)
-        )
-        away_x = (np.arange(window[0].start, window[0].stop) - cell[k, 0])[:, None]
-        away_y = (np.arange(window[1].start, window[1].stop) - cell[k, 1])[None, :]
-        cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
-        along, across = cos * away_x + sin * away_y, cos * away_y - sin * away_x
-        squared_distance = (along / sigmas[k, 0]) ** 2 + (across / sigmas[k, 1]) ** 2
-        in_box = (2 * np.abs(along) <= sides[k, 0]) & (2 * np.abs(across) <= sides[k, 1])
-        in_gaussian = squared_distance <= _CUTOFF_SIGMAS**2
-        if weights[k] > 0:
-            plane = heatmap[(*window, category_ids[k])]
-            gaussian = np.where(in_gaussian, np.exp(-squared_distance / 2), 0)
-            np.maximum(plane, gaussian, out=plane, casting="same_kind")
-        around = background[window]
-        np.minimum(around, weights[k], out=around, where=in_box | in_gaussian)
 
 
 def _box_codes(

@@ -68,3 +68,19 @@ def test_points_at_absurd_distances_do_not_enlarge_the_map():
     ground = GroundMap.of(np.concatenate([plane(), odd]))
     assert ground.heights.size < 1000
     assert ground.at(np.array([[20.0, 0.0]]))[0] == -1.7
+
+
+def test_the_heights_are_those_of_the_definition():
+    """Every square has the second lowest of the lowest points of nine squares."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform([0, -9, -2, 0], [30, 9, 2, 1], (150, 4)).astype(np.float32)
+    points[:3] = [[np.nan, 0, -9, 0], [3, 3, np.nan, 0], [900, 0, -9, 0]]
+    ground = GroundMap.of(points)
+    square = np.floor((points[:, :2] - ground.low) / 3.0)
+    for column, row in np.ndindex(ground.heights.shape):
+        lowest = []
+        for place in np.ndindex(3, 3):
+            near = (square == [column + place[0] - 1, row + place[1] - 1]).all(axis=1)
+            lowest += [np.nanmin(points[near, 2])] if near.any() else []
+        expected = sorted(lowest)[min(1, len(lowest) - 1)] if lowest else np.nan
+        np.testing.assert_equal(ground.heights[column, row], expected)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from oracles import clipping
 from support.strategies import angles, box_arrays
 
+from curate.geometry import overlap
 from curate.geometry.overlap import bev_iou, iou_3d, overlapping_pairs, paired_iou_3d
 
 CAR = np.array([12.3, -4.7, -0.8, 4.2, 1.7, 1.55, 0.3])
@@ -41,9 +42,9 @@ def test_paired_iou_is_the_diagonal(boxes_a, boxes_b):
 @given(box_arrays(), box_arrays())
 def test_iou_is_symmetric_and_within_0_and_1(boxes_a, boxes_b):
     """Bit for bit the same in both orders, never NaN."""
-    for overlap in (bev_iou, iou_3d):
-        matrix = overlap(boxes_a, boxes_b)
-        assert np.array_equal(matrix, overlap(boxes_b, boxes_a).T)
+    for iou in (bev_iou, iou_3d):
+        matrix = iou(boxes_a, boxes_b)
+        assert np.array_equal(matrix, iou(boxes_b, boxes_a).T)
         assert np.all((matrix >= 0) & (matrix <= 1))
 
 
@@ -156,3 +157,23 @@ def test_pairs_of_groups_are_the_matrices_of_each_group():
 def test_no_groups_give_no_pairs():
     none, starts = np.zeros((0, 7)), np.zeros(1, dtype=np.int64)
     assert [len(part) for part in overlapping_pairs(none, starts, none, starts)] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("block", [1, 7, 1 << 20])
+def test_the_pairs_of_groups_do_not_depend_on_the_blocks(monkeypatch, block):
+    """Every pair of a group is yielded once, in ascending order, with empty groups between."""
+    monkeypatch.setattr(overlap, "_BLOCK", block)
+    generator = np.random.default_rng(block)
+    sizes = generator.integers(0, 4, (2, 30)) * (generator.random((2, 30)) < 0.7)
+    for used in (sizes, sizes[:, :0], sizes * [[0], [1]], sizes * [[1], [0]]):
+        starts_a, starts_b = (np.concatenate([[0], np.cumsum(part)]) for part in used)
+        blocks = list(overlap.pairs_within_groups(starts_a, starts_b))
+        assert blocks
+        found = [pair for rows, columns in blocks for pair in zip(rows, columns, strict=True)]
+        expected = [
+            (i, j)
+            for group in range(used.shape[1])
+            for i in range(starts_a[group], starts_a[group + 1])
+            for j in range(starts_b[group], starts_b[group + 1])
+        ]
+        assert found == expected

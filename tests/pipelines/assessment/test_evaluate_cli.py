@@ -88,7 +88,7 @@ def test_the_first_evaluation_reports_that_kernels_are_compiled(
     """The line goes to standard error, so standard output stays JSON."""
     monkeypatch.setattr("curate.geometry.compiled.is_compiled", lambda _kernel: False)
     code, out, err = evaluate(curate, folders, "--json")
-    assert (code, err) == (0, "compiling the evaluation code (first use only, about ten seconds)\n")
+    assert (code, err) == (0, "compiling the evaluation code (first use only, some seconds)\n")
     assert json.loads(out)["objects"]["Car"]
 
 
@@ -290,7 +290,7 @@ def test_a_checkpoint_is_stored_under_its_path(
     curate("evaluate", "--round", "1", "--store", "-w", workspace.root)
     code, _, err = curate("evaluate", "--store", "-w", workspace.root)
     # The kernels are compiled by whichever test comes first.
-    once = "compiling the evaluation code (first use only, about ten seconds)\n"
+    once = "compiling the evaluation code (first use only, some seconds)\n"
     assert (code, err.removeprefix(once)) == (0, "")
     sql = "SELECT source, count(*) AS n FROM evaluation GROUP BY source ORDER BY source"
     rows = query_rows(curate, workspace, sql)

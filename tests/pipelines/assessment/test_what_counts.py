@@ -58,7 +58,7 @@ def evaluate(curate: Curate, labels: Path, results: Path, *more: object) -> dict
 
 def compiled(err: str) -> str:
     """Return standard error without the line about kernels that the first test compiles."""
-    return err.replace("compiling the evaluation code (first use only, about ten seconds)\n", "")
+    return err.replace("compiling the evaluation code (first use only, some seconds)\n", "")
 
 
 def test_labels_without_2d_boxes_give_no_figure_and_say_why(

@@ -181,6 +181,24 @@ def test_the_slot_maximum_has_the_gradient_of_scatter_reduce():
     torch.testing.assert_close(ours, values.grad)
 
 
+def test_cells_without_points_are_those_of_an_empty_canvas():
+    """The network computes only cells with points: maps and gradients are those of all cells."""
+    generator = torch.Generator().manual_seed(0)
+    network = PillarNetwork(PRESETS["small"], 1)
+    features = torch.rand(400, 9, generator=generator)
+    slots = torch.randint(0, 8 * 80 * 100, (400,), generator=generator)
+    weights = torch.rand(2, 32, 80, 100, generator=generator)
+    seen = []
+    network.stem_norm.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    network(features, slots, 2)
+    canvas = SlotMaximum.apply(network.points(features), slots, 8 * 80 * 100)
+    seen.append(network.stem(canvas.view(2, 80, 100, -1).permute(0, 3, 1, 2)))
+    parameters = [*network.points.parameters(), *network.stem.parameters()]
+    ours, dense = (torch.autograd.grad((maps * weights).sum(), parameters) for maps in seen)
+    torch.testing.assert_close(seen[0], seen[1])
+    torch.testing.assert_close(ours, dense, rtol=1e-4, atol=1e-4)
+
+
 def test_the_height_of_the_sensor_does_not_matter(small):
     """Heights are measured from the ground: the scores stay, the boxes move with the points."""
     rng = np.random.default_rng(3)

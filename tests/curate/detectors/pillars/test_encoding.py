@@ -97,6 +97,55 @@ def test_features_are_relative_to_the_pillar():
     )
 
 
+def test_the_features_of_a_cloud_are_those_of_each_pillar_alone():
+    """The pillars of many points do not influence each other."""
+    generator = np.random.default_rng(0)
+    low, high = [-5, -40, -2, 0], [60, 40, 5, 1]
+    points = generator.uniform(low, high, (3000, 4)).astype(np.float32)
+    points = np.concatenate([points, points[:500] + np.float32(0.02)])
+    pillars = encode_points(points, SMALL)
+    (inside,) = np.nonzero([len(encode_points(point[None], SMALL).slots) for point in points])
+    assert len(inside) == len(pillars.slots)
+    for slot in np.unique(pillars.slots):
+        here = pillars.slots == slot
+        alone = encode_points(points[inside[here]], SMALL)
+        assert (alone.slots == slot).all()
+        np.testing.assert_array_equal(alone.features, pillars.features[here])
+
+
+def test_the_maps_are_those_of_the_formulas():
+    """Gaussian and region of overlapping objects, in every cell of the grid."""
+    generator = np.random.default_rng(0)
+    count = 20
+    boxes = np.column_stack(
+        [
+            generator.uniform(0, 20, count), generator.uniform(-10, 10, count), np.zeros(count),
+            generator.uniform(0.4, 6, (count, 3)), generator.uniform(-4, 4, count),
+        ]
+    )  # fmt: skip
+    ids, weights = generator.integers(0, 3, count), np.repeat([0.0, 0.5, 1.0, 0.7], count // 4)
+    targets = targets_of(boxes, weights, ids)
+    heatmap, background = np.zeros((*SMALL.cells, 3)), np.ones(SMALL.cells)
+    x, y = np.meshgrid(*map(np.arange, SMALL.cells), indexing="ij")
+    for box, category, weight in zip(boxes, ids, weights, strict=True):
+        column, row = cell_of(*box[:2])
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        along = cos * (x - column) + sin * (y - row)
+        across = cos * (y - row) - sin * (x - column)
+        sigmas = np.maximum(box[3:5] / SMALL.cell_m / 6, 0.7)
+        squared = (along / sigmas[0]) ** 2 + (across / sigmas[1]) ** 2
+        gaussian = np.exp(-squared / 2) * (squared <= 9) * (weight > 0)
+        heatmap[..., category] = np.maximum(heatmap[..., category], gaussian)
+        region = (np.abs(along) <= box[3] / SMALL.cell_m / 2) & (
+            np.abs(across) <= box[4] / SMALL.cell_m / 2
+        )
+        background[region | (squared <= 9)] = np.minimum(
+            background[region | (squared <= 9)], weight
+        )
+    np.testing.assert_allclose(targets.heatmap, heatmap, rtol=1e-6)
+    np.testing.assert_allclose(targets.background, background, rtol=1e-6)
+
+
 def test_the_heatmap_is_one_at_the_centre_and_zero_far_away():
     """Only in the heatmap of the object's category."""
     targets = targets_of(car(20, 3))
