@@ -92,7 +92,9 @@ class StoredRows:
         """Return the rows of some frames that people decided about, from the view."""
         view = weighted_labels(self.connection)
         query: Select[Any] = select(*map(column, columns))  # type: ignore[assignment]
-        query = query.select_from(view).where(view.c.round == self.round_number, view.c.policy == self.policy)
+        query = query.select_from(view).where(
+            view.c.round == self.round_number, view.c.policy == self.policy
+        )
         rows: list[bulk.Row] = []
         for batch in batched(keys, _FRAMES_PER_QUERY):
             of_batch = view.c.frame.in_([self._names[key] for key in batch])
