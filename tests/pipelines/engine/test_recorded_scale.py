@@ -84,7 +84,7 @@ def killed_and_resumed(workspace: Workspace, seconds: float, generator: np.rando
     kills = 0
     for _ in range(KILLS):
         with start("run", "-w", workspace.root) as running:
-            end = time.monotonic() + generator.uniform(1, 1 + 2 * seconds / KILLS)
+            end = time.monotonic() + generator.uniform(1, 1 + seconds / KILLS)
             while running.poll() is None and time.monotonic() < end:
                 time.sleep(0.05)
             if running.poll() is None:
