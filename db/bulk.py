@@ -27,7 +27,7 @@ from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Select, Table
+from sqlalchemy import Connection, Select, Table, TextualSelect
 
 from curate.files.batches import batched
 from db.evidence import Declaration, evidence_table
@@ -113,7 +113,7 @@ def is_postgresql(connection: Connection) -> bool:
     return connection.dialect.name == "postgresql"
 
 
-def select(connection: Connection, statement: Select[Any]) -> Sequence[Row]:
+def select(connection: Connection, statement: Select[Any] | TextualSelect) -> Sequence[Row]:
     """Return all rows of a query as plain tuples."""
     result = connection.execute(statement)
     if result.cursor is not None and _needs_no_conversion(connection, statement):
@@ -136,7 +136,7 @@ def grouped(rows: Iterable[Row], keys: Iterable[Any] = ()) -> dict[Any, list[Row
     return groups
 
 
-def _needs_no_conversion(connection: Connection, statement: Select[Any]) -> bool:
+def _needs_no_conversion(connection: Connection, statement: Select[Any] | TextualSelect) -> bool:
     """Return whether the values from SQLite's driver can be used as they are.
 
     They can, except for times, which SQLAlchemy converts. Without conversion the rows are fetched

@@ -93,6 +93,18 @@ class RecordedViews(Protocol):
 
 
 @runtime_checkable
+class DeclaresInput(Protocol):
+    """A detector that says whether it looks at the points of a frame; others always get them.
+
+    Attributes:
+        needs_points: False if `predict` takes only the frame's name, calibration and image size.
+            Reading the points takes longer than most of what curate does with a frame.
+    """
+
+    needs_points: bool
+
+
+@runtime_checkable
 class NamesCategories(Protocol):
     """A detector that knows the category names of its boxes before it sees a frame."""
 

@@ -10,20 +10,25 @@ readers ignore. A background label is not in `annotations` but in `background`, 
 which COCO readers do not read. A box outside the image has a `bbox` of size 0, which they skip.
 """
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from curate.detections import Detections
 from curate.errors import ConfigError
-from curate.exporters.base import DataToExport, LabelFileDescription, LabelSet
-from curate.exporters.objects import FrameObjects, categories_of, count_labels, frame_objects
+from curate.exporters.base import DataToExport, LabelSet
+from curate.exporters.json_parts import JsonParts
+from curate.exporters.objects import (
+    FrameObjects,
+    frame_batches,
+    per_calibration,
+    rows_as_dicts,
+)
 from curate.exporters.place import check_place, has_description
-from curate.files.atomic import replace_file
 from curate.frames import Camera, Frame
-from curate.geometry.projection import camera_of_boxes, image_rectangles
+from curate.geometry.projection import image_rectangles
 
 _FORMAT = "curate weighted labels, COCO"
 
@@ -42,10 +47,24 @@ class CocoExporter:
             DataError: if the calibration or the image of a frame cannot be read.
         """
         check_place(path, has_description("info", _FORMAT))
-        frames = list(frame_objects(labels))
-        document = _document(labels.description, frames, labels.read)
-        replace_file(path, json.dumps(document, allow_nan=False).encode())
-        return count_labels(frames)
+        about, count = labels.description, 0
+        rest = sorted(set(labels.truth()["category"]) - set(about.categories))
+        ids = {name: k for k, name in enumerate((*about.categories, *rest), start=1)}
+        info = {
+            "description": _FORMAT,
+            "dataset": about.dataset,
+            "round": about.round,
+            "policy": about.policy,
+            "zero_weight": about.zero_weight,
+            "version": about.code_version,
+        }
+        with JsonParts(path, ("images", "annotations", "background")) as parts:
+            for batch in frame_batches(labels, lambda objects: labels.read(objects.frame_id)):
+                count += sum(len(each.weights) for each, _ in batch if not each.labeled)
+                _add(parts, batch, ids)
+            categories = [{"id": number, "name": name} for name, number in ids.items()]
+            parts.finish({"info": info}, {"categories": categories})
+        return count
 
     def check_data(self, data: DataToExport) -> None:
         """See `curate.exporters.base.Selective`.
@@ -56,40 +75,37 @@ class CocoExporter:
         _check_images(data.frame, data.images)
 
 
-def _document(
-    about: LabelFileDescription, frames: Sequence[FrameObjects], read: Callable[[str], Frame]
-) -> dict[str, Any]:
-    names = [*about.categories, *sorted(categories_of(frames) - set(about.categories))]
-    ids = {name: number for number, name in enumerate(names, start=1)}
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    background: list[dict[str, Any]] = []
-    for objects in frames:
-        frame = read(objects.frame_id)
+def _add(
+    parts: JsonParts, batch: Sequence[tuple[FrameObjects, Frame]], ids: dict[str, int]
+) -> None:
+    """Write the images and annotations of some frames; new categories are added to `ids`."""
+    single = [(objects.detections, frame) for objects, frame in batch if len(frame.cameras) == 1]
+    rectangles = iter(per_calibration(single, _rectangles))
+    for objects, frame in batch:
         _check_images(frame, objects.images)
-        shown_by = camera_of_boxes(objects.detections.boxes, frame.cameras)
-        for number, camera in enumerate(frame.cameras):
-            images.append(_image(len(images) + 1, objects, camera, number))
-            # A label outside all images is with the first one, so that no label is lost.
-            first = (shown_by < 0) & (number == 0)
-            made = _annotations(objects, camera, ids, first)
-            for k, annotation in made:
-                target = background if objects.background[k] else annotations
-                target.append({"id": len(target) + 1, "image_id": len(images)} | annotation)
-    return {
-        "info": {
-            "description": _FORMAT,
-            "dataset": about.dataset,
-            "round": about.round,
-            "policy": about.policy,
-            "zero_weight": about.zero_weight,
-            "version": about.code_version,
-        },
-        "images": images,
-        "annotations": annotations,
-        "background": background,
-        "categories": [{"id": ids[name], "name": name} for name in names],
-    }
+        found = [next(rectangles)] if len(frame.cameras) == 1 else None
+        if found is None:
+            boxes = objects.detections.boxes
+            found = [image_rectangles(boxes, c.calibration, c.image_size) for c in frame.cameras]
+        # A label outside all images is with the first one, so that no label is lost.
+        unseen = np.isnan(found).any(axis=2).all(axis=0)
+        for number, (camera, own) in enumerate(zip(frame.cameras, found, strict=True)):
+            image = parts.next_id("images")
+            parts.add("images", [_image(image, objects, camera, number)])
+            shown = ~np.isnan(own).any(axis=1) | (unseen & (number == 0))
+            made = _annotations(objects, np.nan_to_num(own), ids)
+            for part, written in (
+                ("annotations", shown & ~objects.background),
+                ("background", shown & objects.background),
+            ):
+                chosen = [made[k] for k in np.flatnonzero(written).tolist()]
+                first = parts.next_id(part)
+                numbered = enumerate(chosen, start=first)
+                parts.add(part, [{"id": n, "image_id": image, **each} for n, each in numbered])
+
+
+def _rectangles(found: Detections, frame: Frame) -> np.ndarray:
+    return image_rectangles(found.boxes, frame.calibration, frame.image_size)
 
 
 def _check_images(frame: Frame, images: Sequence[Any]) -> None:
@@ -115,33 +131,29 @@ def _image(number: int, objects: FrameObjects, camera: Camera, position: int) ->
 
 
 def _annotations(
-    objects: FrameObjects, camera: Camera, ids: dict[str, int], unseen: np.ndarray
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield k and the annotation, without its ids, of the labels that a camera shows.
+    objects: FrameObjects, rectangles: np.ndarray, ids: dict[str, int]
+) -> list[dict[str, Any]]:
+    """Return the annotations of all labels in one image, without their ids.
 
     Args:
         objects: the labels of a frame.
-        camera: the camera.
-        ids: numbers of the categories.
-        unseen: (n,) bool, labels outside all images that are written with this image.
+        rectangles: (n, 4) their rectangles in the image; 0 for labels outside.
+        ids: number of each category; new categories are added.
     """
     found = objects.detections
-    rectangles = image_rectangles(found.boxes, camera.calibration, camera.image_size)
-    shown = unseen | ~np.isnan(rectangles).any(axis=1)
-    rectangles = np.nan_to_num(rectangles)
     sizes = rectangles[:, 2:] - rectangles[:, :2]
-    for k in np.flatnonzero(shown).tolist():
-        annotation = {
-            "category_id": ids[str(found.categories[k])],
-            "bbox": [*rectangles[k, :2].tolist(), *sizes[k].tolist()],
-            "area": float(sizes[k].prod()),
+    return rows_as_dicts(
+        {
+            "category_id": [ids.setdefault(c, len(ids) + 1) for c in found.categories.tolist()],
+            "bbox": np.hstack([rectangles[:, :2], sizes]),
+            "area": sizes.prod(axis=1),
             # COCO readers never match a box without area: it must not count as a missed object.
-            "iscrowd": int(objects.ignored[k] or not sizes[k].all()),
-            "weight": float(objects.weights[k]),
-            "box_3d": found.boxes[k].tolist(),
-            "frame": objects.frame_id,
-            "k": int(objects.numbers[k]),
-            "provenance": str(objects.provenance[k]),
+            "iscrowd": (objects.ignored | ~sizes.all(axis=1)).astype(int),
+            "weight": objects.weights,
+            "box_3d": found.boxes,
+            "frame": [objects.frame_id] * len(found),
+            "k": objects.numbers,
+            "provenance": objects.provenance,
+            **({} if objects.labeled else {"score": found.scores}),
         }
-        scored = {} if objects.labeled else {"score": float(found.scores[k])}
-        yield k, annotation | scored
+    )

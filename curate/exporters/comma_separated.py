@@ -1,19 +1,26 @@
 """Export weighted labels as one CSV file (RFC 4180), for spreadsheets and scripts.
 
 The columns are those of `weighted_labels`; an unknown value is an empty field. Numbers are written
-with all their digits and read back exactly. The file cannot state the meaning of weight 0: it
-depends on the policy, which is a column.
+with the digits that are needed to read them back exactly. The file cannot state the meaning of
+weight 0: it depends on the policy, which is a column.
 """
 
 import csv
+import io
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
-from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelSet
+from pydantic_core import to_json
+
+from curate.exporters.base import WEIGHTED_LABEL_COLUMNS, LabelRows, LabelSet
 from curate.exporters.place import check_place
 from curate.files.atomic import atomic_path
 
 _HEADER = ",".join(WEIGHTED_LABEL_COLUMNS)
+# Names that look the same in JSON, between quotes, and in CSV.
+_PLAIN = re.compile(r"(?!.*null)[\w.+/-]+")
 
 
 class CsvExporter:
@@ -25,14 +32,42 @@ class CsvExporter:
     def write(self, path: Path, labels: LabelSet) -> int:
         """See `curate.exporters.base.Exporter`."""
         check_place(path, _is_export)
+        texts = [each.name for each in labels.columns if each.kind == "name"]
         count = 0
-        with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(labels.column_names)
+        with atomic_path(path) as partial, partial.open("wb") as file:
+            file.write(",".join(labels.column_names).encode() + b"\n")
             for block in labels.blocks():
-                writer.writerows(zip(*block.values(), strict=True))
-                count += len(block["k"])
+                file.write(_lines(block, texts))
+                count += len(block.rows)
         return count
+
+
+def _lines(block: LabelRows, texts: Sequence[str]) -> bytes:
+    """Return the rows as CSV.
+
+    Finding the shortest digits of each number takes most of the time; the compiled writer of JSON
+    takes a fifth of that of Python's own. Rows of JSON are CSV, apart from brackets and quotes:
+
+        [[1,"000008",0,"Car",12.5,null],[1,...    1,000008,0,Car,12.5,
+
+    Rows with a name that CSV must quote are written by the module csv.
+
+    Args:
+        block: the rows.
+        texts: the columns with names.
+    """
+    if not block.rows:
+        return b""
+    names = [name for column in texts for name in block[column] if name is not None]
+    if all(isinstance(name, str) and _PLAIN.fullmatch(name) for name in set(names)):
+        json = to_json(block.rows, bytes_mode="hex", inf_nan_mode="constants")
+        # More quotes are of a text in a column of numbers.
+        if json.count(b'"') == 2 * len(names):
+            lines = json[2:-2].replace(b"],[", b"\n").replace(b'"', b"").replace(b"null", b"")
+            return lines + b"\n"
+    written = io.StringIO(newline="")
+    csv.writer(written, lineterminator="\n").writerows(block.rows)
+    return written.getvalue().encode()
 
 
 def _is_export(path: Path) -> bool:

@@ -4,22 +4,25 @@ DIRECTORY/export.json marks the folder as an export and contains the name of its
 """
 
 import glob
+import io
 import json
 import os
 import pickle
 import shutil
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from curate.exporters.place import check_place
 
 _MARKER = "export.json"
-# Every Python 3 that training frameworks still use can read this version.
-_PICKLE_PROTOCOL = 4
+# Every Python 3 can read this version. Pickles can be joined because each of them numbers its
+# objects from 0; in later versions a reader counts on.
+_PICKLE_PROTOCOL = 3
 
 
 def write_folder(
@@ -51,14 +54,63 @@ def write_folder(
     return facts
 
 
+@dataclass(frozen=True)
+class Streamed:
+    """Items that `write_pickle` writes one by one, without having all of them in memory.
+
+    Attributes:
+        items: the items of a list, or the keys and values of a dict.
+        kind: what a reader gets.
+    """
+
+    items: Iterable[Any]
+    kind: type[list[Any]] | type[dict[Any, Any]] = list
+
+
 def write_pickle(path: Path, value: Any) -> None:
     """Write plain containers of numpy arrays in a form that any numpy version reads.
 
     Pickles of numpy 2 refer to a module that numpy before 1.26 does not have. The frameworks that
     read these files often use such an old numpy.
+
+    Args:
+        path: the file.
+        value: the content. It, or values of a dict that it is, may be `Streamed`.
     """
     with path.open("wb") as stream:
-        _ArrayPickler(stream, protocol=_PICKLE_PROTOCOL).dump(value)
+        stream.write(pickle.PROTO + bytes([_PICKLE_PROTOCOL]))
+        _write_value(stream, value)
+        stream.write(pickle.STOP)
+
+
+def _write_value(stream: BinaryIO, value: Any) -> None:
+    """Write the opcodes that put a value onto the stack of a reader.
+
+    Python's own pickler keeps every object that it has written, and all of its output, until the
+    last one. Here each item of a stream is a pickle of its own, between the opcodes that append it.
+    """
+    if isinstance(value, Streamed) and value.kind is list:
+        stream.write(pickle.EMPTY_LIST)
+        stream.writelines(_opcodes(item) + pickle.APPEND for item in value.items)
+        return
+    pairs = value.items if isinstance(value, Streamed) else None
+    if type(value) is dict and any(isinstance(each, Streamed) for each in value.values()):
+        pairs = value.items()
+    if pairs is None:
+        stream.write(_opcodes(value))
+        return
+    stream.write(pickle.EMPTY_DICT)
+    for key, item in pairs:
+        stream.write(_opcodes(key))
+        _write_value(stream, item)
+        stream.write(pickle.SETITEM)
+
+
+def _opcodes(value: Any) -> bytes:
+    """Return the pickle of a value without its first and last opcode, the version and the end."""
+    buffer = io.BytesIO()
+    _ArrayPickler(buffer, protocol=_PICKLE_PROTOCOL).dump(value)
+    return buffer.getvalue()[2:-1]
 
 
 class _ArrayPickler(pickle.Pickler):

@@ -27,18 +27,25 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from curate.datasets.kitti.labels import DONT_CARE, from_detections, write_objects
+from curate.datasets.kitti.labels import (
+    DONT_CARE,
+    KittiObjects,
+    format_objects,
+    from_detections,
+)
 from curate.detections import Detections
-from curate.errors import ConfigError, DataError, error_prefix
+from curate.errors import ConfigError, DataError
 from curate.exporters.base import LabelSet
 from curate.exporters.folder import write_folder
-from curate.exporters.objects import frame_objects
+from curate.exporters.objects import BATCH_FRAMES, frame_objects, per_calibration
+from curate.files.batches import batched
 from curate.frames import Calibration
 from curate.weighting.base import ZeroWeight
 
 LastField = Literal["weight", "score", "none"]
 
 _FORMAT = "curate weighted labels, KITTI"
+_WEIGHT_LINE = "%s " + " ".join(["%.6f"] * 9) + "\n"
 
 
 @dataclass(frozen=True)
@@ -137,40 +144,50 @@ def _write_frames(
     for part in ("label_2", "weight"):
         (folder / part).mkdir(parents=True)
     labels, seen = 0, set()
-    for frame in frames:
-        if frame.frame_id in seen:
-            raise DataError(f"frame {frame.frame_id} occurs twice in the labels to export")
-        seen.add(frame.frame_id)
-        _write_frame(folder, frame, facts["last_field"])
-        labels += len(frame.labels)
+    for batch in batched(frames, BATCH_FRAMES):
+        for frame in batch:
+            if frame.frame_id in seen:
+                raise DataError(f"frame {frame.frame_id} occurs twice in the labels to export")
+            seen.add(frame.frame_id)
+            _check_weights(frame)
+        pairs = [(frame.labels, frame) for frame in batch]
+        for frame, objects in zip(batch, per_calibration(pairs, _in_camera), strict=True):
+            _write_frame(folder, frame, objects, facts["last_field"])
+            labels += len(frame.labels)
     return {**facts, "frames": len(seen), "labels": labels}
 
 
-def _write_frame(folder: Path, frame: WeightedFrame, last_field: str) -> None:
-    weights, labels = frame.weights, frame.labels
-    valid = (weights >= 0) & (weights <= 1)
-    if weights.shape != (len(labels),) or not valid.all():
+def _check_weights(frame: WeightedFrame) -> None:
+    weights, count = frame.weights, len(frame.labels)
+    if weights.shape != (count,) or not ((weights >= 0) & (weights <= 1)).all():
         raise DataError(
-            f"frame {frame.frame_id}: needs one weight in [0, 1] for each of {len(labels)} labels"
+            f"frame {frame.frame_id}: needs one weight in [0, 1] for each of {count} labels"
         )
+
+
+def _in_camera(found: Detections, frame: WeightedFrame) -> KittiObjects:
+    return from_detections(found, frame.calibration, frame.image_size)
+
+
+def _write_frame(
+    folder: Path, frame: WeightedFrame, objects: KittiObjects, last_field: str
+) -> None:
+    weights, labels = frame.weights, frame.labels
     name = f"{frame.frame_id}.txt"
-    with error_prefix(f"frame {frame.frame_id}"):
-        objects = from_detections(labels, frame.calibration, frame.image_size)
     categories = np.where(frame.ignored, DONT_CARE, objects.categories)
     last = {"weight": weights, "score": labels.scores, "none": np.full(len(labels), np.nan)}
     objects = replace(objects, categories=categories, scores=last[last_field])
-    kept = (weights > 0) | frame.ignored
-    write_objects(folder / "label_2" / name, objects.select(kept))
+    path = folder / "label_2" / name
+    path.write_bytes(format_objects(path, objects.select((weights > 0) | frame.ignored)))
+    numbers = np.column_stack([weights, labels.scores, labels.boxes]).tolist()
     lines = [
-        f"{category} {weight:.6f} {score:.6f} {' '.join(f'{number:.6f}' for number in box)}\n"
-        for category, weight, score, box in zip(
-            labels.categories, weights, labels.scores, labels.boxes, strict=True
-        )
+        _WEIGHT_LINE % (category, *row)
+        for category, row in zip(labels.categories.tolist(), numbers, strict=True)
     ]
-    (folder / "weight" / name).write_text("".join(lines), encoding="utf-8")
+    (folder / "weight" / name).write_bytes("".join(lines).encode())
     if frame.provenance is None or not (frame.provenance == "human").any():
         return
-    numbers = np.arange(len(labels)) if frame.numbers is None else frame.numbers
-    lines = [f"{k} {each}\n" for k, each in zip(numbers, frame.provenance, strict=True)]
+    own = np.arange(len(labels)) if frame.numbers is None else frame.numbers
+    lines = [f"{k} {each}\n" for k, each in zip(own, frame.provenance, strict=True)]
     (folder / "provenance").mkdir(exist_ok=True)
     (folder / "provenance" / name).write_text("".join(lines), encoding="utf-8")

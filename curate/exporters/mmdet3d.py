@@ -19,24 +19,25 @@ KITTI's categories have the numbers of `KittiDataset`; other categories follow. 
 identity, and Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
 import numpy as np
 
-from curate.datasets.kitti.labels import from_detections
+from curate.datasets.kitti.labels import KittiObjects, from_detections
+from curate.detections import Detections
 from curate.exporters.base import LabelSet
-from curate.exporters.folder import write_folder, write_pickle
+from curate.exporters.folder import Streamed, write_folder, write_pickle
 from curate.exporters.objects import (
     FrameObjects,
-    categories_of,
-    count_labels,
     difficulties,
-    frame_objects,
+    frame_batches,
+    per_calibration,
+    rows_as_dicts,
 )
-from curate.frames import Calibration, Frame
+from curate.frames import Frame
 from curate.geometry.projection import project_points
 
 _FORMAT = "curate weighted labels, mmdetection3d"
@@ -62,32 +63,52 @@ class MMDet3DExporter:
 
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
-    about, frames = labels.description, list(frame_objects(labels))
-    configured = [name for name in about.categories if name not in _KITTI_ORDER]
-    rest = sorted(categories_of(frames) - {*_KITTI_ORDER, *configured})
-    numbers = {name: number for number, name in enumerate((*_KITTI_ORDER, *configured, *rest))}
-    infos = []
-    for position, objects in enumerate(frames):
-        name = objects.frame_id
-        index = int(name) if name.isdecimal() else position
-        infos.append(_info(index, objects, labels.read(name), numbers))
+    about = labels.description
+    known = dict.fromkeys((*_KITTI_ORDER, *about.categories))
+    rest = sorted(set(labels.truth()["category"]) - set(known))
+    numbers = {name: number for number, name in enumerate((*known, *rest))}
+    facts = {"zero_weight": about.zero_weight, "frames": 0, "labels": 0}
     metainfo = {
         "categories": numbers,
         "dataset": about.dataset,
         "zero_weight": about.zero_weight,
         "info_version": "1.1",
     }
-    write_pickle(folder / "kitti_infos_train.pkl", {"metainfo": metainfo, "data_list": infos})
-    return {
-        "zero_weight": about.zero_weight,
-        "frames": len(infos),
-        "labels": count_labels(frames),
-    }
+    # A category that only labels have gets its number when the first of them is written.
+    document = {"data_list": Streamed(_infos(labels, numbers, facts)), "metainfo": metainfo}
+    write_pickle(folder / "kitti_infos_train.pkl", document)
+    return facts
 
 
-def _info(
-    index: int, objects: FrameObjects, frame: Frame, numbers: Mapping[str, int]
-) -> dict[str, Any]:
+def _infos(
+    labels: LabelSet, numbers: dict[str, int], facts: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield the infos of all frames, and count frames and labels."""
+    for batch in frame_batches(labels, lambda objects: labels.read(objects.frame_id)):
+        found = [(objects.detections, frame) for objects, frame in batch]
+        in_camera = per_calibration(found, _in_camera)
+        projected = per_calibration(found, _projected)
+        for (objects, frame), own, pixels in zip(batch, in_camera, projected, strict=True):
+            name = objects.frame_id
+            index = int(name) if name.isdecimal() else facts["frames"]
+            facts["frames"] += 1
+            facts["labels"] += 0 if objects.labeled else len(objects.weights)
+            yield _info(index, objects, frame) | {
+                "instances": _instances(objects, own, pixels, numbers)
+            }
+
+
+def _in_camera(found: Detections, frame: Frame) -> KittiObjects:
+    return from_detections(found, frame.calibration, frame.image_size, "mmdetection3d")
+
+
+def _projected(found: Detections, frame: Frame) -> np.ndarray:
+    """Return (n, 3) pixel and depth of the centres."""
+    return np.column_stack(project_points(found.boxes, frame.calibration))
+
+
+def _info(index: int, objects: FrameObjects, frame: Frame) -> dict[str, Any]:
+    """Return the info of a frame without its instances."""
     points, image, *_ = (*(PurePosixPath(file).name for file in objects.files), None)
     width, height = frame.image_size or (None, None)
     of_image = {"img_path": image, "height": height, "width": width}
@@ -110,47 +131,47 @@ def _info(
             "lidar_path": points,
             "Tr_velo_to_cam": calibration.lidar_to_camera.tolist(),
         },
-        "instances": _instances(objects, calibration, frame.image_size, numbers),
     }
 
 
 def _instances(
-    objects: FrameObjects,
-    calibration: Calibration,
-    image_size: tuple[int, int] | None,
-    numbers: Mapping[str, int],
+    objects: FrameObjects, in_camera: KittiObjects, projected: np.ndarray, numbers: dict[str, int]
 ) -> list[dict[str, Any]]:
-    found = objects.detections
-    in_camera = from_detections(found, calibration, image_size, "mmdetection3d")
-    centres, depths = project_points(found.boxes, calibration)
-    levels = difficulties(in_camera.boxes_2d, objects.truncated, objects.occluded)
-    lengths_first = in_camera.dimensions[:, [2, 0, 1]]
-    instances = []
-    for k in range(len(found)):
-        category, weight = str(found.categories[k]), float(objects.weights[k])
-        label = _SKIPPED_LABEL if weight == 0 else numbers[category]
-        box = (*in_camera.locations[k], *lengths_first[k], in_camera.rotations_y[k])
-        instances.append(
-            {
-                "bbox": in_camera.boxes_2d[k].tolist(),
-                "bbox_label": label,
-                "bbox_3d": [float(number) for number in box],
-                "bbox_label_3d": label,
-                "depth": float(depths[k]),
-                "center_2d": centres[k].tolist(),
-                "num_lidar_pts": int(objects.points[k]),
-                "difficulty": int(levels[k]),
-                "truncated": float(objects.truncated[k]),
-                "occluded": int(objects.occluded[k]),
-                "alpha": float(in_camera.alpha[k]),
-                "score": float(found.scores[k]),
-                "index": k,
-                "group_id": k,
-                "weight": weight,
-                "ignored": bool(objects.ignored[k]),
-                "category": category,
-                "k": int(objects.numbers[k]),
-                "provenance": str(objects.provenance[k]),
-            }
-        )
-    return instances
+    """Return the objects of a frame.
+
+    Args:
+        objects: the objects.
+        in_camera: the same in the camera frame.
+        projected: (n, 3) pixel and depth of the centres.
+        numbers: number of each category; new categories are added.
+    """
+    found, count = objects.detections, len(objects.detections)
+    categories = found.categories.tolist()
+    learned = (objects.weights > 0).tolist()
+    labels = [
+        numbers.setdefault(name, len(numbers)) if kept else _SKIPPED_LABEL
+        for name, kept in zip(categories, learned, strict=True)
+    ]
+    boxes = [in_camera.locations, in_camera.dimensions[:, [2, 0, 1]], in_camera.rotations_y]
+    columns = {
+        "bbox": in_camera.boxes_2d,
+        "bbox_label": labels,
+        "bbox_3d": np.column_stack(boxes),
+        "bbox_label_3d": labels,
+        "depth": projected[:, 2],
+        "center_2d": projected[:, :2],
+        "num_lidar_pts": objects.points,
+        "difficulty": difficulties(in_camera.boxes_2d, objects.truncated, objects.occluded),
+        "truncated": objects.truncated,
+        "occluded": objects.occluded,
+        "alpha": in_camera.alpha,
+        "score": found.scores,
+        "index": range(count),
+        "group_id": range(count),
+        "weight": objects.weights,
+        "ignored": objects.ignored,
+        "category": categories,
+        "k": objects.numbers,
+        "provenance": objects.provenance,
+    }
+    return rows_as_dicts(columns)

@@ -10,7 +10,6 @@ nuScenes' tools do not read. `zero_weight` in `meta` gives the meaning of weight
 unknown and written as 0.
 """
 
-import json
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,9 +19,9 @@ from scipy.spatial.transform import Rotation
 from curate.datasets.nuscenes.names import detection_name
 from curate.errors import ConfigError, error_prefix
 from curate.exporters.base import DataToExport, LabelSet
-from curate.exporters.objects import FrameObjects, frame_objects
+from curate.exporters.json_parts import JsonParts
+from curate.exporters.objects import FrameObjects, frame_objects, rows_as_dicts
 from curate.exporters.place import check_place, has_description
-from curate.files.atomic import replace_file
 from curate.frames import Calibration
 
 _FORMAT = "curate weighted labels, nuScenes"
@@ -42,35 +41,34 @@ class NuScenesExporter:
             DataError: if the calibration of a frame cannot be read.
         """
         check_place(path, has_description("meta", _FORMAT))
-        parts: dict[str, dict[str, list[dict[str, Any]]]] = {
-            "results": {}, "ignored": {}, "background": {},
-        }  # fmt: skip
-        count = 0
-        for objects in frame_objects(labels):
-            if objects.labeled:
-                continue
-            boxes = _boxes(objects, labels.read(objects.frame_id).calibration)
-            masks = (objects.weights > 0, objects.ignored, objects.background)
-            for part, mask in zip(parts.values(), masks, strict=True):
-                part[objects.frame_id] = [boxes[k] for k in np.flatnonzero(mask)]
-            count += len(boxes)
-        about = labels.description
-        document = {
-            "meta": {
-                "use_camera": True,
-                "use_lidar": True,
-                "use_radar": False,
-                "use_map": False,
-                "use_external": False,
-                "description": _FORMAT,
-                "round": about.round,
-                "policy": about.policy,
-                "zero_weight": about.zero_weight,
-                "version": about.code_version,
-            },
-            **parts,
+        about, count = labels.description, 0
+        meta = {
+            "use_camera": True,
+            "use_lidar": True,
+            "use_radar": False,
+            "use_map": False,
+            "use_external": False,
+            "description": _FORMAT,
+            "round": about.round,
+            "policy": about.policy,
+            "zero_weight": about.zero_weight,
+            "version": about.code_version,
         }
-        replace_file(path, json.dumps(document, allow_nan=False).encode())
+        with JsonParts(path, ("results", "ignored", "background"), "objects") as parts:
+            for objects in frame_objects(labels):
+                if objects.labeled:
+                    continue
+                boxes = _boxes(objects, labels.read(objects.frame_id).calibration)
+                masks = {
+                    "results": objects.weights > 0,
+                    "ignored": objects.ignored,
+                    "background": objects.background,
+                }
+                for part, mask in masks.items():
+                    chosen = [boxes[k] for k in np.flatnonzero(mask).tolist()]
+                    parts.add(part, {objects.frame_id: chosen})
+                count += len(boxes)
+            parts.finish({"meta": meta})
         return count
 
     def check_data(self, data: DataToExport) -> None:
@@ -90,22 +88,24 @@ def _boxes(objects: FrameObjects, calibration: Calibration) -> list[dict[str, An
     found = objects.detections
     centres = found.boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     turns = _quaternions(pose, found.boxes[:, 6])
-    return [
+    count = len(found)
+    with error_prefix(f"frame {objects.frame_id}"):
+        names = [_detection_name(category) for category in found.categories.tolist()]
+    return rows_as_dicts(
         {
-            "sample_token": objects.frame_id,
-            "translation": centres[k].tolist(),
-            "size": found.boxes[k, [4, 3, 5]].tolist(),
-            "rotation": turns[k].tolist(),
-            "velocity": [0.0, 0.0],
-            "detection_name": _name(objects, k),
-            "detection_score": float(found.scores[k]),
-            "attribute_name": "",
-            "weight": float(objects.weights[k]),
-            "k": int(objects.numbers[k]),
-            "provenance": str(objects.provenance[k]),
+            "sample_token": [objects.frame_id] * count,
+            "translation": centres,
+            "size": found.boxes[:, [4, 3, 5]],
+            "rotation": turns,
+            "velocity": [[0.0, 0.0]] * count,
+            "detection_name": names,
+            "detection_score": found.scores,
+            "attribute_name": [""] * count,
+            "weight": objects.weights,
+            "k": objects.numbers,
+            "provenance": objects.provenance,
         }
-        for k in range(len(found))
-    ]
+    )
 
 
 def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
@@ -114,11 +114,6 @@ def _quaternions(pose: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         return np.zeros((0, 4))
     turns = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_euler("z", yaw[:, None])
     return np.asarray(np.atleast_2d(turns.as_quat())[:, [3, 0, 1, 2]])
-
-
-def _name(objects: FrameObjects, k: int) -> str:
-    with error_prefix(f"frame {objects.frame_id}"):
-        return _detection_name(str(objects.detections.categories[k]))
 
 
 def _detection_name(category: str) -> str:

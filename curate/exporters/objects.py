@@ -1,17 +1,32 @@
 """Iterate over a label set frame by frame, for formats that contain both X_l and X_u."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from itertools import pairwise
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
-from curate.detections import Detections, as_categories
-from curate.errors import DataError
+from curate.detections import Columns, Detections, as_categories
+from curate.errors import DataError, error_prefix
 from curate.evaluation.kitti_rules import MAX_OCCLUSIONS, MAX_TRUNCATIONS, MIN_HEIGHTS
-from curate.exporters.base import BOX_COLUMNS, Columns, FrameFiles, LabelSet, by_frame
+from curate.exporters.base import (
+    BOX_COLUMNS,
+    GROUND_TRUTH_COLUMNS,
+    FrameFiles,
+    LabelRows,
+    LabelSet,
+)
+from curate.files.batches import batched
+from curate.frames import Calibration, Frame
 
 UNKNOWN = -1
+BATCH_FRAMES = 256
+"""Number of frames that are converted at once."""
+
+Result = TypeVar("Result", bound=np.ndarray | Columns)
+FrameT = TypeVar("FrameT", bound="Calibrated")
 
 
 @dataclass(frozen=True)
@@ -55,26 +70,66 @@ class FrameObjects:
         return np.asarray((self.weights == 0) & ~self.ignored)
 
 
+@dataclass(frozen=True)
+class _Objects:
+    """The objects of one or several frames; the fields are those of `FrameObjects`."""
+
+    boxes: np.ndarray
+    scores: np.ndarray
+    categories: list[str]
+    weights: np.ndarray
+    ignored: np.ndarray
+    points: np.ndarray
+    truncated: np.ndarray
+    occluded: np.ndarray
+    numbers: np.ndarray
+    provenance: list[str]
+
+    def part(self, start: int, end: int) -> Self:
+        """Return some consecutive objects."""
+        return type(self)(*(getattr(self, name)[start:end] for name in _FIELDS))
+
+    def of(self, files: FrameFiles) -> FrameObjects:
+        """Return the objects as those of a frame."""
+        return FrameObjects(
+            files.frame,
+            files.split == "labeled",
+            (files.points, *files.images),
+            Detections(self.boxes, self.scores, as_categories(self.categories)),
+            self.weights,
+            self.ignored,
+            self.points,
+            self.truncated,
+            self.occluded,
+            self.numbers,
+            as_categories(self.provenance),
+        )
+
+
+_FIELDS = tuple(field.name for field in fields(_Objects))
+
+
 def frame_objects(labels: LabelSet) -> Iterator[FrameObjects]:
     """Yield the frames of a label set in their order, including frames without objects.
 
-    The labels are read once and only one frame is in memory at a time.
+    The labels are read once and only one block of them is in memory at a time.
 
     Raises:
         DataError: see `LabelSet.blocks`, or if the labels are not in the order of the frames.
     """
-    truth: Mapping[str, Columns] = dict(by_frame([labels.truth()]))
-    no_rows: Columns = {name: [] for name in (*labels.column_names, "truncated", "occluded")}
-    found = by_frame(labels.blocks())
+    truth = dict(_by_frame([labels.truth()], _true_objects))
+    ignoring = labels.description.zero_weight == "ignore"
+    found = _by_frame(labels.blocks(), partial(_weighted_objects, ignoring=ignoring))
     following = next(found, None)
+    nothing = _true_objects(LabelRows(GROUND_TRUTH_COLUMNS, []))
     for files in labels.frames:
         if files.split == "labeled":
-            yield _true_objects(files, truth.get(files.frame, no_rows))
+            yield truth.get(files.frame, nothing).of(files)
         elif following is not None and following[0] == files.frame:
-            yield _weighted_objects(files, following[1], labels)
+            yield following[1].of(files)
             following = next(found, None)
         else:
-            yield _weighted_objects(files, no_rows, labels)
+            yield nothing.of(files)
     if following is not None:
         raise DataError(
             f"labels of frame {following[0]} are out of order; sort the labels in the order of the "
@@ -82,14 +137,79 @@ def frame_objects(labels: LabelSet) -> Iterator[FrameObjects]:
         )
 
 
-def count_labels(frames: Sequence[FrameObjects]) -> int:
-    """Return the number of pseudo-labels of the frames."""
-    return sum(len(objects.weights) for objects in frames if not objects.labeled)
+def frame_batches(
+    labels: LabelSet, read: Callable[[FrameObjects], Frame]
+) -> Iterator[list[tuple[FrameObjects, Frame]]]:
+    """Yield the frames of a label set in batches; `read` reads a frame."""
+    for batch in batched(frame_objects(labels), BATCH_FRAMES):
+        yield [(objects, read(objects)) for objects in batch]
 
 
-def categories_of(frames: Sequence[FrameObjects]) -> set[str]:
-    """Return the categories that occur in the frames."""
-    return {name for objects in frames for name in objects.detections.categories.tolist()}
+class Calibrated(Protocol):
+    """A frame with a calibration, such as `Frame`."""
+
+    @property
+    def frame_id(self) -> str:
+        """Name of the frame."""
+        ...
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the first camera."""
+        ...
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """Size of the first camera's image."""
+        ...
+
+
+def per_calibration(
+    batch: Sequence[tuple[Detections, FrameT]], compute: Callable[[Detections, FrameT], Result]
+) -> list[Result]:
+    """Return the result of a function for the detections of each frame of a batch.
+
+    It is called once for all frames with the same calibration and image size, because calls of
+    NumPy for the few labels of one frame take longer than their arithmetic.
+
+    Args:
+        batch: frames with their detections.
+        compute: returns columns, or an array, with one row per detection. It may use the
+            calibration and the image size of the first camera.
+
+    Raises:
+        DataError: if the function raises it; the message names the first of the frames.
+    """
+    groups: dict[Any, list[int]] = {}
+    for place, (_, frame) in enumerate(batch):
+        matrices = (frame.calibration.projection, frame.calibration.lidar_to_camera)
+        key = (*(matrix.tobytes() for matrix in matrices), frame.calibration.rotation_y)
+        groups.setdefault((key, frame.image_size), []).append(place)
+    results: dict[int, Result] = {}
+    for places in groups.values():
+        parts, first = [batch[place][0] for place in places], batch[places[0]][1]
+        with error_prefix(f"frame {first.frame_id}"):
+            computed = compute(_joined(parts), first)
+        start = 0
+        for place, part in zip(places, parts, strict=True):
+            rows = np.arange(start, start + len(part))
+            own: Any = computed[rows] if isinstance(computed, np.ndarray) else computed.select(rows)
+            results[place] = own
+            start += len(part)
+    return [results[place] for place in range(len(batch))]
+
+
+def rows_as_dicts(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of columns (arrays or sequences) as dicts of plain Python values."""
+    values = (each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
+def _joined(parts: Sequence[Detections]) -> Detections:
+    if len(parts) == 1:
+        return parts[0]
+    columns = ([getattr(each, name.name) for each in parts] for name in fields(Detections))
+    return Detections(*map(np.concatenate, columns))
 
 
 def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarray) -> np.ndarray:
@@ -109,44 +229,72 @@ def difficulties(boxes_2d: np.ndarray, truncated: np.ndarray, occluded: np.ndarr
     return found
 
 
-def _true_objects(files: FrameFiles, rows: Columns) -> FrameObjects:
-    count = len(rows["category"])
-    return FrameObjects(
-        files.frame,
-        labeled=True,
-        files=(files.points, *files.images),
-        detections=_detections(rows, [1.0] * count),
+def _by_frame(
+    blocks: Iterable[LabelRows], convert: Callable[[LabelRows], _Objects]
+) -> Iterator[tuple[str, _Objects]]:
+    """Yield the name and the objects of each frame; a frame may continue in the next block."""
+    for block in _whole_frames(blocks):
+        names = block["frame"]
+        objects = convert(block)
+        starts = [row for row in range(1, len(names)) if names[row] != names[row - 1]]
+        for start, end in pairwise([0, *starts, len(names)]):
+            yield names[start], objects.part(start, end)
+
+
+def _whole_frames(blocks: Iterable[LabelRows]) -> Iterator[LabelRows]:
+    """Yield the rows in other blocks, each of which ends with the last row of a frame."""
+    pending: list[tuple[Any, ...]] = []
+    names: tuple[str, ...] = ()
+    for block in blocks:
+        names = block.names
+        frame = names.index("frame")
+        pending = [*pending, *block.rows]
+        complete = len(pending)
+        while complete and pending[complete - 1][frame] == pending[-1][frame]:
+            complete -= 1
+        if complete:
+            yield LabelRows(names, pending[:complete])
+            pending = pending[complete:]
+    if pending:
+        yield LabelRows(names, pending)
+
+
+def _true_objects(block: LabelRows) -> _Objects:
+    count = len(block.rows)
+    return _Objects(
+        _boxes(block),
+        np.ones(count),
+        block["category"],
         weights=np.ones(count),
         ignored=np.zeros(count, dtype=bool),
         points=np.full(count, UNKNOWN, dtype=np.int64),
-        truncated=np.array(rows["truncated"], dtype=np.float64),
-        occluded=np.array(rows["occluded"], dtype=np.int64),
-        numbers=np.array(rows["k"], dtype=np.int64),
-        provenance=as_categories(["ground_truth"] * count),
+        truncated=np.array(block["truncated"], dtype=np.float64),
+        occluded=np.array(block["occluded"], dtype=np.int64),
+        numbers=np.array(block["k"], dtype=np.int64),
+        provenance=["ground_truth"] * count,
     )
 
 
-def _weighted_objects(files: FrameFiles, rows: Columns, labels: LabelSet) -> FrameObjects:
-    count = len(rows["category"])
-    weights = np.array(rows["weight"], dtype=np.float64)
+def _weighted_objects(block: LabelRows, *, ignoring: bool) -> _Objects:
+    """Return labels; `ignoring` is whether those of weight 0 are regions to ignore."""
+    count, provenance = len(block.rows), block["provenance"]
+    weights = np.array(block["weight"], dtype=np.float64)
     # A label that a person rejected is background, whatever weight 0 means for the policy.
-    provenance = as_categories(rows["provenance"])
-    ignoring = labels.description.zero_weight == "ignore"
-    return FrameObjects(
-        files.frame,
-        labeled=False,
-        files=(files.points, *files.images),
-        detections=_detections(rows, rows["score"]),
+    by_detector = np.array([each != "human" for each in provenance], dtype=bool)
+    return _Objects(
+        _boxes(block),
+        np.array(block["score"], dtype=np.float64),
+        block["category"],
         weights=weights,
-        ignored=(weights == 0) & ignoring & (provenance != "human"),
-        points=np.array([UNKNOWN if m is None else m for m in rows["points"]], dtype=np.int64),
+        ignored=(weights == 0) & ignoring & by_detector,
+        points=np.array([UNKNOWN if m is None else m for m in block["points"]], dtype=np.int64),
         truncated=np.full(count, float(UNKNOWN)),
         occluded=np.full(count, UNKNOWN, dtype=np.int64),
-        numbers=np.array(rows["k"], dtype=np.int64),
+        numbers=np.array(block["k"], dtype=np.int64),
         provenance=provenance,
     )
 
 
-def _detections(rows: Columns, scores: Sequence[Any]) -> Detections:
-    boxes = np.array([rows[name] for name in BOX_COLUMNS], dtype=np.float64).T
-    return Detections(boxes, np.array(scores, dtype=np.float64), as_categories(rows["category"]))
+def _boxes(block: LabelRows) -> np.ndarray:
+    columns = [np.array(block[name], dtype=np.float64) for name in BOX_COLUMNS]
+    return np.stack(columns, axis=1)

@@ -21,7 +21,7 @@ in the LiDAR frame. R0_rect is the identity, and Tr_velo_to_cam is the complete 
 LiDAR to the rectified camera.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,10 +29,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from curate.datasets.kitti.labels import DONT_CARE, KittiObjects, from_detections
+from curate.detections import Detections
 from curate.errors import ConfigError
 from curate.exporters.base import DataToExport, LabelSet
-from curate.exporters.folder import write_folder, write_pickle
-from curate.exporters.objects import UNKNOWN, FrameObjects, difficulties, frame_objects
+from curate.exporters.folder import Streamed, write_folder, write_pickle
+from curate.exporters.objects import (
+    UNKNOWN,
+    FrameObjects,
+    difficulties,
+    frame_batches,
+    per_calibration,
+)
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import points_in_box_mask
 
@@ -66,22 +73,39 @@ class OpenPCDetExporter:
 
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
-    infos: list[Info] = []
-    database: dict[str, list[Info]] = {}
     (folder / _DATABASE).mkdir()
-    count = 0
-    for objects in frame_objects(labels):
-        count += 0 if objects.labeled else len(objects.weights)
-        read = labels.read_points if objects.labeled else labels.read
-        frame = read(objects.frame_id)
-        info = _info(objects, frame)
-        if objects.labeled:
-            _cut_out(folder, frame, info["annos"], database)
-        infos.append(info)
+    database: dict[str, list[Info]] = {}
+    facts = {"zero_weight": labels.description.zero_weight, "frames": 0, "labels": 0}
+    infos = Streamed(_infos(folder, labels, database, facts))
     write_pickle(folder / "kitti_infos_train.pkl", infos)
     write_pickle(folder / "kitti_dbinfos_train.pkl", database)
-    zero_weight = labels.description.zero_weight
-    return {"zero_weight": zero_weight, "frames": len(infos), "labels": count}
+    return facts
+
+
+def _infos(
+    folder: Path, labels: LabelSet, database: dict[str, list[Info]], facts: dict[str, Any]
+) -> Iterator[Info]:
+    """Yield the infos of all frames; cut out the objects of X_l, and count frames and labels."""
+
+    def read(objects: FrameObjects) -> Frame:
+        frame = (labels.read_points if objects.labeled else labels.read)(objects.frame_id)
+        _image_size(frame)
+        return frame
+
+    for batch in frame_batches(labels, read):
+        found = [(objects.detections, frame) for objects, frame in batch]
+        in_camera = per_calibration(found, _in_camera)
+        for (objects, frame), own in zip(batch, in_camera, strict=True):
+            info = _info(objects, frame, own)
+            if objects.labeled:
+                _cut_out(folder, frame, info["annos"], database)
+            facts["frames"] += 1
+            facts["labels"] += 0 if objects.labeled else len(objects.weights)
+            yield info
+
+
+def _in_camera(found: Detections, frame: Frame) -> KittiObjects:
+    return from_detections(found, frame.calibration, frame.image_size, "openpcdet")
 
 
 def _image_size(frame: Frame) -> tuple[int, int]:
@@ -94,12 +118,9 @@ def _image_size(frame: Frame) -> tuple[int, int]:
     return frame.image_size
 
 
-def _info(objects: FrameObjects, frame: Frame) -> Info:
+def _info(objects: FrameObjects, frame: Frame, in_camera: KittiObjects) -> Info:
     width, height = _image_size(frame)
     last_row = np.array([[0.0, 0, 0, 1]])
-    in_camera = from_detections(
-        objects.detections, frame.calibration, frame.image_size, "openpcdet"
-    )
     return {
         "point_cloud": {"num_features": 4, "lidar_idx": objects.frame_id},
         "image": {

@@ -9,14 +9,16 @@ are written in row groups, and only one group is in memory at a time.
 
 import json
 from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
 from curate.errors import DataError, one_line
-from curate.exporters.base import Columns, LabelFileDescription, LabelSet
+from curate.exporters.base import LabelFileDescription, LabelRows, LabelSet
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
 from curate.files.atomic import atomic_path
+from curate.files.batches import batched
 from curate.files.parquet import load_parquet
 from curate.priors.base import Column
 
@@ -53,8 +55,8 @@ class ParquetExporter:
             atomic_path(path) as partial,
             parquet.ParquetWriter(partial, schema, compression="zstd") as writer,
         ):
-            for group in _groups(labels.blocks(), self.rows_per_group):
-                batch = _batch(arrow, schema, group)
+            for rows in _groups(labels.blocks(), self.rows_per_group):
+                batch = _batch(arrow, schema, LabelRows(labels.column_names, rows))
                 writer.write_batch(batch, row_group_size=batch.num_rows)
                 count += batch.num_rows
         return count
@@ -94,20 +96,12 @@ def _metadata(about: LabelFileDescription) -> dict[str, str]:
     return {f"curate.{key}": value for key, value in metadata.items()}
 
 
-def _groups(blocks: Iterable[Columns], size: int) -> Iterator[Columns]:
-    """Yield the same rows in blocks of `size` rows; the last block may be smaller."""
-    pending: dict[str, list[Any]] = {}
-    for block in blocks:
-        for name, values in block.items():
-            pending.setdefault(name, []).extend(values)
-        while len(pending["k"]) >= size:
-            yield {name: values[:size] for name, values in pending.items()}
-            pending = {name: values[size:] for name, values in pending.items()}
-    if pending and pending["k"]:
-        yield pending
+def _groups(blocks: Iterable[LabelRows], size: int) -> Iterator[list[tuple[Any, ...]]]:
+    """Yield the same rows in groups of `size` rows; the last group may be smaller."""
+    return batched(chain.from_iterable(block.rows for block in blocks), size)
 
 
-def _batch(arrow: Any, schema: Any, rows: Columns) -> Any:
+def _batch(arrow: Any, schema: Any, rows: LabelRows) -> Any:
     """Return a record batch of the rows."""
     columns = []
     for field in schema:

@@ -10,20 +10,19 @@ row, it is "ignore".
 
 import json
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 from curate.errors import DataError
-from curate.exporters.base import GROUND_TRUTH_COLUMNS, Columns, LabelFileDescription, LabelSet
+from curate.exporters.base import LabelFileDescription, LabelRows, LabelSet
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.exporters.place import check_place
 from curate.files.atomic import atomic_path
 from curate.priors.base import Column
 
-_FRAME_INSERTION = "INSERT INTO frame VALUES (:frame, :split, :points, :image, :calibration)"
+_FRAME_INSERTION = "INSERT INTO frame VALUES (?, ?, ?, ?, ?)"
 _TYPES: Final = {"int32": "INTEGER", "int64": "INTEGER", "float64": "REAL", "name": "TEXT"}
 _CHECKS: Final = {
     **dict.fromkeys(("length", "width", "height"), "{} > 0"),
@@ -149,7 +148,6 @@ def _fill(connection: sqlite3.Connection, path: Path, labels: LabelSet) -> int:
     """Write all tables and return the number of labels."""
     names = labels.column_names
     view = f"CREATE VIEW weighted_labels AS SELECT {', '.join(names)} FROM label;"  # noqa: S608
-    last: list[Any] = ["none"]
     count = 0
     # No journal: an incomplete file is deleted, never rolled back.
     connection.executescript(
@@ -159,27 +157,37 @@ def _fill(connection: sqlite3.Connection, path: Path, labels: LabelSet) -> int:
     try:
         meta = _meta(labels.description, format_version(labels.columns))
         connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-        connection.executemany(_FRAME_INSERTION, map(asdict, labels.frames))
-        truth = _remembered(labels.truth(), last)
-        connection.executemany(_insertion("ground_truth", GROUND_TRUTH_COLUMNS), truth)
+        connection.executemany(
+            _FRAME_INSERTION,
+            ((f.frame, f.split, f.points, f.image, f.calibration) for f in labels.frames),
+        )
+        _insert(connection, path, "ground_truth", labels.truth())
         for block in labels.blocks():
-            connection.executemany(_insertion("label", names), _remembered(block, last))
-            count += len(block["k"])
+            _insert(connection, path, "label", block)
+            count += len(block.rows)
         connection.executescript(view + _INDEXES)
     except sqlite3.IntegrityError as error:
-        raise DataError(
-            f"{path}: a row violates a constraint: {error}; the row is {last[0]}"
-        ) from None
-    except (sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
-        raise DataError(
-            f"{path}: a row does not fit its table: {error}; the row is {last[0]}"
-        ) from None
+        raise DataError(f"{path}: a row violates a constraint: {error}") from None
     return count
 
 
-def _insertion(table: str, names: Sequence[str]) -> str:
-    marks = ", ".join("?" * len(names))
-    return f"INSERT INTO {table} ({', '.join(names)}) VALUES ({marks})"  # noqa: S608
+def _insert(connection: sqlite3.Connection, path: Path, table: str, block: LabelRows) -> None:
+    """Insert rows.
+
+    Raises:
+        DataError: if one does not fit the table; the message shows it.
+    """
+    marks = ", ".join("?" * len(block.names))
+    statement = f"INSERT INTO {table} ({', '.join(block.names)}) VALUES ({marks})"  # noqa: S608
+    before = connection.total_changes
+    try:
+        connection.executemany(statement, block.rows)
+    except (sqlite3.IntegrityError, sqlite3.ProgrammingError, sqlite3.InterfaceError) as error:
+        problem = "violates a constraint"
+        if not isinstance(error, sqlite3.IntegrityError):
+            problem = "does not fit its table"
+        row = block.rows[connection.total_changes - before]
+        raise DataError(f"{path}: a row {problem}: {error}; the row is {row}") from None
 
 
 def _meta(about: LabelFileDescription, version: str) -> Mapping[str, str]:
@@ -194,10 +202,3 @@ def _meta(about: LabelFileDescription, version: str) -> Mapping[str, str]:
         "zero_weight": about.zero_weight,
         "code_version": about.code_version,
     }
-
-
-def _remembered(block: Columns, last: list[Any]) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows and store the current one in `last[0]`, for error messages."""
-    for row in zip(*block.values(), strict=True):
-        last[0] = row
-        yield row

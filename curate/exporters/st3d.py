@@ -19,7 +19,7 @@ export.json gives the meaning of weight 0.
 The boxes are not shifted. A data set configuration with SHIFT_COOR expects shifted coordinates.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,7 +28,7 @@ import numpy as np
 
 from curate.errors import DataError
 from curate.exporters.base import LabelSet
-from curate.exporters.folder import write_folder, write_pickle
+from curate.exporters.folder import Streamed, write_folder, write_pickle
 from curate.exporters.objects import FrameObjects, frame_objects
 
 _FORMAT = "curate weighted labels, ST3D"
@@ -50,19 +50,20 @@ class ST3DExporter:
 
 
 def _fill(folder: Path, labels: LabelSet) -> Mapping[str, Any]:
-    categories = labels.description.categories
-    frames = {
-        objects.frame_id: _pseudo_labels(objects, categories)
-        for objects in frame_objects(labels)
-        if not objects.labeled
-    }
-    write_pickle(folder / "ps_label_e0.pkl", frames)
-    return {
-        "zero_weight": labels.description.zero_weight,
-        "frames": len(frames),
-        "labels": sum(len(frame["weight"]) for frame in frames.values()),
-        "categories": list(categories),
-    }
+    about = labels.description
+    facts = {"zero_weight": about.zero_weight, "frames": 0, "labels": 0}
+    write_pickle(folder / "ps_label_e0.pkl", Streamed(_frames(labels, facts), dict))
+    return {**facts, "categories": list(about.categories)}
+
+
+def _frames(labels: LabelSet, facts: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the unlabeled frames, and count frames and labels."""
+    for objects in frame_objects(labels):
+        if not objects.labeled:
+            found = _pseudo_labels(objects, labels.description.categories)
+            facts["frames"] += 1
+            facts["labels"] += len(found["weight"])
+            yield objects.frame_id, found
 
 
 def _pseudo_labels(objects: FrameObjects, categories: tuple[str, ...]) -> dict[str, Any]:

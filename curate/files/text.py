@@ -24,13 +24,19 @@ def read_text(path: Path, kind: str = "text", *, error_type: type[CurateError] =
     Raises:
         CurateError: of class `error_type`, if the file is missing, cannot be read, or is not UTF-8.
     """
+    return decode_text(read_content(path, kind, error_type=error_type), path, error_type=error_type)
+
+
+def read_content(
+    path: Path, kind: str = "text", *, error_type: type[CurateError] = DataError
+) -> bytes:
+    """Return the bytes of a file; see `read_text`."""
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise error_type(f"{path}: no such {kind} file") from None
     except OSError as error:
         raise error_type(f"{path}: cannot be read: {error.strerror}") from error
-    return decode_text(content, path, error_type=error_type)
 
 
 def read_lines(

@@ -87,20 +87,24 @@ def background_id(classes: ClassMap) -> int:
 
 def describe_unexpected_ids(class_ids: "np.ndarray", classes: ClassMap) -> str | None:
     """Return an error text if (h, w) class ids are not of the declared class set, else None."""
+    import cv2
     import numpy as np
 
+    present: set[int] | None = None
     for name, valid in _VALID_IDS.items():
         if CLASS_MAPS[name] != classes:
             continue
-        unexpected = np.setdiff1d(class_ids, [*valid, _UNLABELED])
-        if len(unexpected):
+        if present is None:
+            # A hundredth of the time of np.unique.
+            counts = cv2.calcHist([np.ascontiguousarray(class_ids)], [0], None, [256], [0, 256])
+            present = set(np.flatnonzero(counts).tolist())
+        unexpected = sorted(present - {*valid, _UNLABELED})
+        if unexpected:
             problem = (
                 f"contains class {unexpected[0]}, but the classes of {name} are 0 to {valid[-1]}"
             )
             candidates = [
-                candidate
-                for candidate, ids in _VALID_IDS.items()
-                if not len(np.setdiff1d(class_ids, [*ids, _UNLABELED]))
+                candidate for candidate, ids in _VALID_IDS.items() if present <= {*ids, _UNLABELED}
             ]
             if not candidates:
                 return problem

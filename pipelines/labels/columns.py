@@ -1,24 +1,22 @@
 """Labels of rounds as aligned columns: all at once, or a block of frames at a time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Float, Integer, Select, Text, select, type_coerce
+from sqlalchemy import Connection
 
 from curate.evaluation.label_changes import RoundLabels
-from curate.files.batches import batched
 from db import bulk
 from db.evidence import weighted_label_columns
 from db.models import BOX_COLUMNS
-from db.views import weighted_labels
 from pipelines.labels.by_frame import check_weights, not_weighted_error
+from pipelines.labels.stored_rows import StoredRows
 from pipelines.workspace.workspace import Workspace
 
 _BLOCK_FRAMES = 1000
-# SQLite looks up this many frames one by one; with more it would scan the whole round.
-_FRAMES_PER_QUERY = 8
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ def read_columns(workspace: Workspace, round_number: int, policy: str) -> LabelC
     """
     with workspace.database.reading() as connection:
         check_weights(connection, round_number, policy)
-        found = _read(workspace, connection, round_number, policy)
+        found = _read(workspace, StoredRows(connection, round_number, policy))
     if not len(found):
         raise not_weighted_error(round_number, policy)
     return found
@@ -81,7 +79,7 @@ def read_frame_columns(
 ) -> LabelColumns:
     """Return the labels of one frame; there may be none."""
     with workspace.database.reading() as connection:
-        return _read(workspace, connection, round_number, policy, [frame])
+        return _read(workspace, StoredRows(connection, round_number, policy), [frame])
 
 
 def read_blocks(
@@ -96,14 +94,19 @@ def read_blocks(
         WorkspaceError: if the policy has weighted nothing in one of the rounds.
         DataError: if a weight is not in [0, 1].
     """
-    frame = bulk.table("frame").c.frame
     labels = dict.fromkeys(rounds, 0)
     with workspace.database.reading() as connection:
         for each in labels:
             check_weights(connection, each, policy)
-        names = sorted(row[0] for row in bulk.select(connection, select(frame)))
-        for block in batched(names, _BLOCK_FRAMES):
-            found = {each: _read(workspace, connection, each, policy, block) for each in labels}
+        kinds = _kinds(connection)
+        stored = [StoredRows(connection, each, policy) for each in labels]
+        for block in zip(
+            *(each.blocks(tuple(kinds), size=_BLOCK_FRAMES) for each in stored), strict=True
+        ):
+            found = {
+                each: ordered(_columns(kinds, [rows]), workspace.config.dataset.categories)
+                for each, rows in zip(labels, block, strict=True)
+            }
             labels = {each: count + len(found[each]) for each, count in labels.items()}
             yield tuple(found[each] for each in rounds)
     for each, count in labels.items():
@@ -112,51 +115,63 @@ def read_blocks(
 
 
 def _read(
-    workspace: Workspace,
-    connection: Connection,
-    round_number: int,
-    policy: str,
-    frames: Sequence[str] | None = None,
+    workspace: Workspace, stored: StoredRows, frames: Sequence[str] | None = None
 ) -> LabelColumns:
     """Return the labels of a round, of all frames or of those with the given names."""
-    view = weighted_labels(connection).c
-    kinds: dict[str, Any] = {"frame": Text(), "k": Integer(), "category": Text()}
-    kinds |= dict.fromkeys((*BOX_COLUMNS, *numeric_columns(connection)), Float())
-    # Without ORDER BY: to sort millions of rows, the database would write them to the disk.
-    columns = [type_coerce(view[name], kind).label(name) for name, kind in kinds.items()]
-    query: Select[Any] = select(*columns)
-    query = query.where(view.round == round_number, view.policy == policy)
-    queries = [query]
-    if frames is not None:
-        batches = batched(frames, _FRAMES_PER_QUERY)
-        queries = [query.where(view.frame.in_(batch)) for batch in batches]
-    parts = [bulk.select_columns(connection, each) for each in queries]
-    found = {name: np.concatenate([part[name] for part in parts]) for name in kinds}
+    kinds = _kinds(stored.connection)
+    found = _columns(kinds, stored.blocks(tuple(kinds), frames))
     return ordered(found, workspace.config.dataset.categories)
 
 
-def ordered(found: dict[str, np.ndarray], categories: tuple[str, ...]) -> LabelColumns:
+def _kinds(connection: Connection) -> Mapping[str, type]:
+    """Return the columns to read, and the type of their values."""
+    texts = {"frame": str, "k": int, "category": str}
+    return texts | dict.fromkeys((*BOX_COLUMNS, *numeric_columns(connection)), float)
+
+
+def _columns(kinds: Mapping[str, type], blocks: Iterable[list[bulk.Row]]) -> dict[str, Any]:
+    """Return rows as columns: lists of text, and arrays of numbers with NaN for null."""
+    found: dict[str, Any] = {name: [] for name in kinds}
+    for rows in blocks:
+        for (name, kind), values in zip(kinds.items(), zip(*rows, strict=True), strict=False):
+            found[name].append(values if kind is str else np.array(values, dtype=kind))
+    for name, kind in kinds.items():
+        parts = found[name]
+        if kind is str:
+            found[name] = list(chain.from_iterable(parts))
+        else:
+            found[name] = np.concatenate([np.zeros(0, kind), *parts])
+    return found
+
+
+def ordered(found: Mapping[str, Any], categories: tuple[str, ...]) -> LabelColumns:
     """Return columns sorted by frame name and k.
 
     Args:
-        found: (n,) columns by name, in any order: frame, k, category, the box, further numbers.
+        found: columns of n values by name, in any order: frame and category (lists of str), k, the
+            box, further numbers (arrays).
         categories: the configured categories, which are numbered first.
     """
-    names, frames = np.unique(found["frame"], return_inverse=True)
+    names = sorted(set(found["frame"]))
+    categories = tuple(dict.fromkeys((*categories, *sorted(set(found["category"])))))
+    frames = _numbers(found["frame"], names)
     order = np.lexsort([found["k"], frames])
-    present, inverse = np.unique(found["category"], return_inverse=True)
-    categories = tuple(dict.fromkeys((*categories, *present.tolist())))
-    number = np.array([categories.index(name) for name in present], dtype=np.int64)
     keys = ("frame", "k", "category", *BOX_COLUMNS)
     return LabelColumns(
-        names.tolist(),
+        names,
         frames[order],
         found["k"][order],
-        number[inverse[order]],
+        _numbers(found["category"], categories)[order],
         categories,
         np.stack([found[name][order] for name in BOX_COLUMNS], axis=1),
         {name: values[order] for name, values in found.items() if name not in keys},
     )
+
+
+def _numbers(values: Sequence[str], names: Sequence[str]) -> np.ndarray:
+    """Return (n,) int64 the index of each value among the names."""
+    place = {name: number for number, name in enumerate(names)}
+    return np.fromiter(map(place.__getitem__, values), np.int64, len(values))
 
 
 def as_rounds(before: LabelColumns, after: LabelColumns) -> tuple[RoundLabels, RoundLabels]:

@@ -1,5 +1,5 @@
 -- Labels with a weight above 0, and those that people decided, per category and distance from the LiDAR.
-WITH placed AS (
+WITH placed AS MATERIALIZED (
     SELECT round, policy, category, weight, provenance,
            CASE WHEN x * x + y * y < 400 THEN '00-20 m'
                 WHEN x * x + y * y < 1600 THEN '20-40 m'

@@ -2,6 +2,10 @@
 
 They use only SQL that both SQLite and PostgreSQL understand. A description that ends in "(working
 database)" marks a query of tables that an exported file does not have.
+
+Queries that count all labels select their columns in a common table expression that is
+MATERIALIZED: SQLite then reads only the tables of these columns. In a query that counts the rows of
+the view itself, it looks up the evidence of every label.
 """
 
 import re

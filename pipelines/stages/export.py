@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, column, select
+from sqlalchemy import Connection, select
 
 import curate
 from curate.errors import WorkspaceError
@@ -17,6 +16,7 @@ from curate.exporters.base import (
     Exporter,
     FrameFiles,
     LabelFileDescription,
+    LabelRows,
     LabelSet,
 )
 from curate.exporters.sqlite import SqliteExporter, check_label_file_place
@@ -30,12 +30,12 @@ from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.labels.by_frame import check_weights
 from pipelines.labels.human_labels import fingerprint
+from pipelines.labels.stored_rows import StoredRows
 from pipelines.stages.methods import zero_weight_of
 from pipelines.stages.vanished import check_labels, remember_labels
 from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
-_CHUNK = 10_000
 # SQLite limits the number of parameters of a statement.
 _FRAMES_PER_QUERY = 400
 
@@ -223,23 +223,17 @@ class StoredLabels:
     policy: str
     columns: tuple[Column, ...]
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[LabelRows]:
         """Yield blocks of some thousand labels: millions at once would not fit into memory."""
-        names = [each.name for each in self.columns]
-        query = self._of(*map(column, names)).order_by(column("frame"), column("k"))
+        names = tuple(each.name for each in self.columns)
         with self.workspace.database.reading() as connection:
-            result = connection.execution_options(stream_results=True).execute(query)
-            for rows in result.partitions(_CHUNK):
-                yield dict(zip(names, zip(*rows, strict=True), strict=True))
+            stored = StoredRows(connection, self.round_number, self.policy)
+            for rows in stored.blocks(names):
+                yield LabelRows(names, rows)
 
     def frames(self, connection: Connection) -> set[str]:
         """Return the names of the frames with labels."""
-        return set(connection.execute(self._of(column("frame")).distinct()).scalars())
-
-    def _of(self, *columns: ColumnElement[Any]) -> Select[Any]:
-        labels = WEIGHTED_LABELS.c
-        selected = (labels.round == self.round_number, labels.policy == self.policy)
-        return select(*columns).select_from(WEIGHTED_LABELS).where(*selected)
+        return set(StoredRows(connection, self.round_number, self.policy).frames())
 
 
 def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
@@ -256,12 +250,8 @@ def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
         frame.image_path.label("image"),
         frame.calibration_path.label("calibration"),
     ).where(frame.split != "val")
-    rows = connection.execute(query.order_by(frame.frame)).mappings()
-    return [
-        FrameFiles(**row)
-        for row in rows
-        if row["split"] == "labeled" or row["frame"] in with_labels
-    ]
+    rows = sorted(bulk.select(connection, query))
+    return [FrameFiles(*row) for row in rows if row[1] == "labeled" or row[0] in with_labels]
 
 
 def _with_further_images(workspace: Workspace, frames: list[FrameFiles]) -> list[FrameFiles]:

@@ -9,7 +9,13 @@ import numpy as np
 
 from curate.category_names import renamed
 from curate.detections import Detections
-from curate.detectors.base import BatchDetector, CopiesDetector, Detector, NamesCategories
+from curate.detectors.base import (
+    BatchDetector,
+    CopiesDetector,
+    DeclaresInput,
+    Detector,
+    NamesCategories,
+)
 from curate.detectors.devices import AUTO
 from curate.detectors.precision import FLOAT32
 from curate.errors import ConfigError, CurateError, ModelError, error_prefix
@@ -121,6 +127,8 @@ class Predict:
 
     def _read(self, frame_id: str) -> Frame:
         """Return a frame as the detector sees it."""
+        if isinstance(self.detector, DeclaresInput) and not self.detector.needs_points:
+            return self.dataset.read(frame_id, points=False)
         return visible(self.dataset.read(frame_id), self.config)
 
     def detect(self, frames: Sequence[Frame]) -> Sequence[Detections | CurateError]:

@@ -17,14 +17,15 @@ may both be present if their entries are equal.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from curate.errors import DataError
 from curate.files.atomic import replace_file
-from curate.files.text import read_lines
+from curate.files.text import decode_text, read_content
 from curate.frames import Calibration, RotationY
 from curate.geometry.mounting import check_lidar_to_camera
 
@@ -57,20 +58,17 @@ class CalibrationLines:
 
     Args:
         path: the file.
+        content: its content; None to read it.
 
     Raises:
         DataError: if the file is missing or not text.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: bytes | None = None) -> None:
         self.path = path
-        if not path.exists() and not any(path.parent.glob("*.txt")):
-            raise DataError(
-                f"{path}: no such calibration file, nor any other in the folder; if the data have "
-                'no camera, describe them as a plain folder (docs/datasets.md, "Plain folders")'
-            )
+        content = _read(path) if content is None else content
         self.lines: dict[str, list[CalibrationLine]] = {}
-        for number, text in enumerate(read_lines(path, "calibration"), start=1):
+        for number, text in enumerate(decode_text(content, path).split("\n"), start=1):
             if match := _LINE.fullmatch(text):
                 line = CalibrationLine(f"{path}:{number}", match[1], match[2])
                 self.lines.setdefault(match[1].casefold(), []).append(line)
@@ -121,7 +119,21 @@ def read_calibration(
             entries that are not finite, two names of one matrix differ, or the transform from
             LiDAR to camera is not a rotation and a translation.
     """
-    lines = CalibrationLines(path)
+    return _parsed(_File(_read(path), path), camera, rotation_y)
+
+
+@dataclass(frozen=True)
+class _File:
+    """The content of a file, which is equal to that of a file at another path."""
+
+    content: bytes
+    path: Path = field(compare=False)
+
+
+# All frames of a drive have the same calibration, each in a file of its own.
+@lru_cache(maxsize=256)
+def _parsed(file: _File, camera: int, rotation_y: RotationY) -> Calibration:
+    path, lines = file.path, CalibrationLines(file.path, file.content)
     names = (f"P{camera}", f"P_rect_{camera:02d}")
     projection = lines.matrix(names, _WIDE)
     rectification = lines.matrix(_RECTIFICATIONS, _SQUARE)
@@ -140,7 +152,10 @@ def read_calibration(
         to_rectified = product
     transform = _square(np.asarray(to_rectified))
     check_lidar_to_camera(transform, place)
-    return Calibration(np.asarray(projection), transform, rotation_y=rotation_y)
+    shared = np.array(projection), np.array(transform)
+    for matrix in shared:
+        matrix.setflags(write=False)
+    return Calibration(*shared, rotation_y=rotation_y)
 
 
 def read_raw_calibration(
@@ -202,6 +217,16 @@ def _require(
     if missing == [_RECTIFICATIONS]:
         hint += "; if the images are rectified, add the line R0_rect: 1 0 0 0 1 0 0 0 1"
     raise DataError(f"{lines.path}: {shown}{hint}")
+
+
+def _read(path: Path) -> bytes:
+    """Return the content of a calibration file."""
+    if not path.exists() and not any(path.parent.glob("*.txt")):
+        raise DataError(
+            f"{path}: no such calibration file, nor any other in the folder; if the data have "
+            'no camera, describe them as a plain folder (docs/datasets.md, "Plain folders")'
+        )
+    return read_content(path, "calibration")
 
 
 def _to_camera(lines: CalibrationLines, camera: int) -> np.ndarray | None:

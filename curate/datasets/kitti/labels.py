@@ -14,7 +14,7 @@ its centre is (20, -2, -0.95), and its yaw is 0.
 """
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Self
 
@@ -48,6 +48,11 @@ LABEL_FIELDS, RESULT_FIELDS = 15, 16
 _CUSTOM_FIELDS = 8
 # Largest accepted absolute value of a field; KITTI's placeholders go down to -1000.
 _MAX_VALUE = 1e6
+# Numbers of a line: truncated, occluded, alpha, 2D box, shape, score.
+_OBJECT_LINE = "%s %.2f %d %.4f" + " %.2f" * 4 + " %.4f" * 7
+_REGION_LINE = "%s %d %d %d" + " %.2f" * 4 + " %d" * 7
+_SCORE = " %.6f"
+_REGION = (-1, -1, -10, 0, 0, 0, 0, -1, -1, -1, -1000, -1000, -1000, -10, 0)
 # Locations that mean "unknown": KITTI's placeholder, and the camera itself.
 _NO_LOCATION = ((-1000.0, -1000.0, -1000.0), (0.0, 0.0, 0.0))
 _WITHOUT_3D = (
@@ -171,17 +176,41 @@ def write_objects(path: StrPath, objects: KittiObjects) -> None:
         DataError: if a number is not finite, or only some objects have scores.
     """
     path = Path(path)
+    replace_file(path, format_objects(path, objects))
+
+
+def format_objects(path: Path, objects: KittiObjects) -> bytes:
+    """Return the content of a label or result file; see `write_objects`.
+
+    Args:
+        path: the file, for messages.
+        objects: its objects.
+
+    Raises:
+        DataError: if a number is not finite, or only some objects have scores.
+    """
     scored = ~np.isnan(objects.scores)
     if scored.any() and not scored.all():
         raise DataError(f"{path}: {np.sum(~scored)} of {len(scored)} objects have no score")
-    lines = [
-        _format(objects, index) + (f" {objects.scores[index]:.6f}" if scored[index] else "")
-        for index in range(len(objects))
-    ]
-    for number, line in enumerate(lines, start=1):
-        if "nan" in line or "inf" in line:
-            raise DataError(f"{path}:{number}: cannot write numbers that are not finite: {line}")
-    replace_file(path, "".join(f"{line}\n" for line in lines).encode())
+    region = objects.categories == DONT_CARE
+    numbers = np.column_stack(
+        [getattr(objects, column.name) for column in fields(objects) if column.name != "categories"]
+    )
+    numbers[region] = _REGION
+    numbers[region, 3:7], numbers[region, 14] = objects.boxes_2d[region], objects.scores[region]
+    last = 15 if scored.any() else 14
+    finite = np.isfinite(numbers[:, :last]).all(axis=1)
+    forms = [form + _SCORE * (last == 15) for form in (_OBJECT_LINE, _REGION_LINE)]
+    rows = zip(
+        region.tolist(), objects.categories.tolist(), numbers[:, :last].tolist(), strict=True
+    )
+    lines = [forms[is_region] % (category, *row) for is_region, category, row in rows]
+    if not finite.all():
+        number = int(np.argmin(finite))
+        raise DataError(
+            f"{path}:{number + 1}: cannot write numbers that are not finite: {lines[number]}"
+        )
+    return "".join(f"{line}\n" for line in lines).encode()
 
 
 def read_annotations(
@@ -337,19 +366,6 @@ def _columns(values: np.ndarray) -> tuple[np.ndarray, ...]:
         values[:, 10:13],
         values[:, 13],
         scores,
-    )
-
-
-def _format(objects: KittiObjects, index: int) -> str:
-    """Return the label line of one object, without the score."""
-    category = objects.categories[index]
-    box_2d = " ".join(f"{pixel:.2f}" for pixel in objects.boxes_2d[index])
-    if category == DONT_CARE:
-        return f"{DONT_CARE} -1 -1 -10 {box_2d} -1 -1 -1 -1000 -1000 -1000 -10"
-    shape = (*objects.dimensions[index], *objects.locations[index], objects.rotations_y[index])
-    return (
-        f"{category} {objects.truncated[index]:.2f} {objects.occluded[index]} "
-        f"{objects.alpha[index]:.4f} {box_2d} {' '.join(f'{number:.4f}' for number in shape)}"
     )
 
 

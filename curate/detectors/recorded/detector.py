@@ -120,6 +120,8 @@ class RecordedDetector:
         ConfigError: if an option is invalid or missing.
     """
 
+    needs_points = False
+
     def __init__(
         self,
         path: StrPath,

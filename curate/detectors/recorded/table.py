@@ -14,8 +14,10 @@ not as an empty scene. A frame that has only rows of other views has no detectio
 
 import codecs
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO
 
@@ -134,14 +136,15 @@ class TableRecord:
         first, last = (int(np.searchsorted(self.names, key, side)) for side in ("left", "right"))
         if first == last:
             raise DataError(f"no recorded detections for frame {frame_id} in {self.path}")
-        fields: list[list[str]] = []
+        fields: list[Sequence[str]] = []
         lines: list[int] = []
+        ordered = _in_order(self.order)
         with self.path.open("rb") as file:
             for begin, end, line in self.places[first:last].tolist():
                 file.seek(begin)
                 text = io.StringIO(file.read(end - begin).decode(), newline="")
                 for number, row in self.header.rows(text, self.path, line):
-                    fields.append(_ordered(row, self.order))
+                    fields.append(ordered(row))
                     lines.append(number)
         return _views_of(self.path, fields, lines, _numbers(self.path, fields, lines, self.sigmoid))
 
@@ -195,10 +198,10 @@ class _Rows:
 
     def _rows_with_places(
         self, order: Sequence[int | None]
-    ) -> Iterator[tuple[list[str], tuple[int, int, int]]]:
-        begin = self._end
+    ) -> Iterator[tuple[Sequence[str], tuple[int, int, int]]]:
+        begin, ordered = self._end, _in_order(order)
         for line, row in self.header.rows(self._lines, self.path, self.header.line + 1):
-            yield _ordered(row, order), (begin, self._end, line)
+            yield ordered(row), (begin, self._end, line)
             begin = self._end
 
 
@@ -211,12 +214,17 @@ def _places(path: Path, header: Header) -> tuple[int | None, ...]:
     return tuple(found.get(name) for name in _COLUMNS)
 
 
-def _ordered(row: Sequence[str], order: Sequence[int | None]) -> list[str]:
-    """Return the fields of a row in the order of `_COLUMNS`."""
-    return [
-        _ORIGINAL[name] if place is None else row[place]
-        for name, place in zip(_COLUMNS, order, strict=True)
+def _in_order(order: Sequence[int | None]) -> Callable[[list[str]], Sequence[str]]:
+    """Return a function that returns the fields of a row in the order of `_COLUMNS`."""
+    if None not in order:
+        return itemgetter(*order)
+    # The fields of views that a file does not have are taken from behind the row.
+    defaults = [
+        _ORIGINAL[name] for name, place in zip(_COLUMNS, order, strict=True) if place is None
     ]
+    behind = iter(range(-len(defaults), 0))
+    chosen = itemgetter(*(next(behind) if place is None else place for place in order))
+    return lambda row: chosen([*row, *defaults])
 
 
 def _check_block(
@@ -298,13 +306,16 @@ def _numbers(
     path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int], sigmoid: bool
 ) -> np.ndarray:
     """Return the (n, 12) columns of `_NUMBERS`; raise DataError for an invalid value."""
-    numbers = np.empty((len(rows), len(_NUMBERS)))
-    for index, (row, line) in enumerate(zip(rows, lines, strict=True)):
-        try:
-            numbers[index] = [float(field) for field in row[2:]]
-        except ValueError:
-            problem = next(filter(None, map(number_problem, row[2:])))
-            raise DataError(f"{path}:{line}: {problem}") from None
+    fields = chain.from_iterable(row[2:] for row in rows)
+    try:
+        numbers = np.fromiter(map(float, fields), np.float64).reshape(len(rows), len(_NUMBERS))
+    except ValueError:
+        problems = (
+            (line, next(filter(None, map(number_problem, row[2:])), None))
+            for row, line in zip(rows, lines, strict=True)
+        )
+        line, problem = next(each for each in problems if each[1])
+        raise DataError(f"{path}:{line}: {problem}") from None
     _check_values(path, lines, numbers, sigmoid)
     return numbers
 

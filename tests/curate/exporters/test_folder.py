@@ -2,13 +2,15 @@
 
 import json
 import os
+import pickle
 import socket
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
-from curate.exporters.folder import write_folder
+from curate.exporters.folder import Streamed, write_folder, write_pickle
 
 OTHER = """
 import sys
@@ -45,3 +47,53 @@ def test_only_the_remains_of_a_killed_export_are_removed(tmp_path, runs):
     left.mkdir()
     write_folder(tmp_path / "out", "toy", lambda _: {})
     assert left.exists() == runs
+
+
+def test_a_streamed_pickle_equals_one_of_the_whole(tmp_path):
+    """Strings that occur in several items, arrays, and an object that occurs twice in one item."""
+    shared = [1, "k"]
+    items = [{"k": i, "twice": [shared, shared], "box": np.arange(i)} for i in range(300)]
+    path = tmp_path / "a.pkl"
+
+    def read(value):
+        write_pickle(path, value)
+        return pickle.loads(path.read_bytes())
+
+    for found in (read(Streamed(iter(items))), read({"list": Streamed(items), "k": 1})["list"]):
+        assert [each["k"] for each in found] == list(range(300))
+        assert all(len(each["box"]) == each["k"] and each["box"].flags.writeable for each in found)
+        assert found[7]["twice"] == [shared, shared]
+        assert found[7]["twice"][0] is found[7]["twice"][1]
+    by_name = ((str(each["k"]), each["box"]) for each in items)
+    found = read(Streamed(by_name, dict))
+    assert {name: len(box) for name, box in found.items()} == {str(i): i for i in range(300)}
+    assert read(Streamed([])) == []
+    assert read({}) == {}
+
+
+def test_a_streamed_pickle_does_not_keep_its_items(tmp_path):
+    """Memory does not grow with their number."""
+    alive = []
+
+    class Item:
+        """Counts how many of them exist."""
+
+        def __init__(self):
+            alive.append(1)
+
+        def __del__(self):
+            alive.pop()
+
+        def __reduce__(self):
+            return str, ()
+
+    most = 0
+
+    def items():
+        nonlocal most
+        for _ in range(1000):
+            yield Item()
+            most = max(most, len(alive))
+
+    write_pickle(tmp_path / "a.pkl", Streamed(items()))
+    assert most < 10

@@ -19,9 +19,9 @@ def test_any_order_of_rows_gives_the_same_columns(order: list[int]) -> None:
     names, kinds = ["b", "c", "a"], ["Car", "Cyclist"]
     numbers = dict.fromkeys((*BOX_COLUMNS, *NUMBERS), np.array(order, dtype=float))
     columns = {
-        "frame": np.array([names[i % 3] for i in order]),
+        "frame": [names[i % 3] for i in order],
         "k": np.array(order) // 3,
-        "category": np.array([kinds[i % 2] for i in order]),
+        "category": [kinds[i % 2] for i in order],
     }
     found = ordered(columns | numbers, ("Car", "Cyclist"))
     assert found.frame_names == ["a", "b", "c"]

@@ -134,3 +134,19 @@ def test_a_calibration_is_read_back_exactly(tmp_path):
     found = read_calibration(tmp_path / "a.txt")
     np.testing.assert_array_equal(found.projection, calibration.projection)
     np.testing.assert_array_equal(found.lidar_to_camera, calibration.lidar_to_camera)
+
+
+def test_files_with_equal_content_are_parsed_once(tmp_path):
+    """A changed file is read again, and an error names its own file."""
+    paths = [tmp_path / f"{name}.txt" for name in "ab"]
+    for path in paths:
+        path.write_text("\n".join(LINES))
+    first, second = map(read_calibration, paths)
+    assert first is second
+    assert not first.projection.flags.writeable
+    paths[1].write_text("\n".join((line("P2", PROJECTION + 1), *LINES[1:])))
+    assert (read_calibration(paths[1]).projection == PROJECTION + 1).all()
+    for path in paths:
+        path.write_text(LINES[0])
+        with pytest.raises(DataError, match=path.name):
+            read_calibration(path)
