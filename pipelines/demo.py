@@ -93,7 +93,7 @@ def run_demo(demo: Demo, say: Say) -> None:
     workspace = initialise(demo.directory, demo.config(), str(demo.labeled), "")
     workspace = workspace.with_settings(
         "run", workers=demo.processes, executor="process" if demo.processes > 1 else "serial"
-    )
+    ).with_settings("train", processes="auto" if demo.processes > 1 else 1)
     graph = graph_of(workspace)
     counts = [len(workspace.frames(split)) for split in ("labeled", "unlabeled", "val")]
     say("\n2. Train the teacher on few labels, predict on the others, weight the predictions.")

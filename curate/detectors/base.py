@@ -154,7 +154,7 @@ class Student(Protocol):
     Everything that training changes is in the parameters and buffers of `network`. The trainer
     optimises and averages them and stores them in snapshots. Randomness in the network or the loss
     (dropout, sampled proposals) comes from torch's global generators, which the trainer seeds in
-    every step.
+    every step. For a training on several processes a student is pickled.
 
     Attributes:
         preset: name of the preset that the network was built from.
@@ -182,7 +182,9 @@ class Student(Protocol):
             batch: from `encode`.
             expected_objects: average number of objects in the labeled frames of a batch. Normalise
                 the loss by this number or by counts (of objects, anchors, proposals), never by sums
-                of weights: these would cancel the weights.
+                of weights: these would cancel the weights. Several processes split a batch, and the
+                sum of their losses is its loss: divide by counts of the whole batch, see
+                `curate.detectors.whole_batch`. The terms are always the same.
         """
         ...
 

@@ -13,25 +13,34 @@ from curate.training.settings import TrainingSettings
 
 
 class Batches:
-    """The batches of a training by step number.
+    """The batches of a training by step number, or the part of them that one process trains on.
 
     A batch depends only on the labels, the settings and the step number. A killed training
-    therefore resumes with the same batches.
+    therefore resumes with the same batches, and several processes split the batch of one.
 
     Args:
         labels: the training frames.
         settings: settings of the training.
+        rank: number of this process.
+        processes: number of processes that split each batch.
 
     Raises:
         DataError: if no frame is labeled.
     """
 
-    def __init__(self, labels: WeightedLabels, settings: TrainingSettings) -> None:
+    def __init__(
+        self,
+        labels: WeightedLabels,
+        settings: TrainingSettings,
+        rank: int = 0,
+        processes: int = 1,
+    ) -> None:
         self._labels = labels
         self._settings = settings
+        self._rank, self._processes = rank, processes
         self._augmentation = settings.augmentation()
         self._cache: dict[int, Sample] = {}
-        self._free_cache_bytes = settings.cache_bytes
+        self._free_cache_bytes = settings.cache_bytes // processes
         self.labeled = np.flatnonzero(labels.labeled)
         self.unlabeled = np.flatnonzero(~labels.labeled)
         if len(self.labeled) == 0:
@@ -42,9 +51,15 @@ class Batches:
         self.objects_per_frame = max(objects / len(labeled), 1.0)
 
     def __getitem__(self, step: int) -> list[Sample]:
-        """Return the augmented samples of a step."""
+        """Return this process's augmented samples of a step.
+
+        The frames are dealt out in turn, first those of X_l, then those of X_u, so that every
+        process gets about as many of each kind.
+        """
         augmented = []
-        for position, index in enumerate(self.frame_indices(step)):
+        indices = self.frame_indices(step)
+        for position in range(self._rank, len(indices), self._processes):
+            index = indices[position]
             generator = np.random.default_rng([self._settings.seed, step, position])
             augmented.append(self._augmentation.apply(self._sample(index), self.bank, generator))
         return augmented
@@ -52,7 +67,9 @@ class Batches:
     def for_loader(self, loaders: int) -> Self:
         """Return the same batches for one of several loaders: its cache is empty and smaller."""
         own = copy.copy(self)
-        vars(own).update(_cache={}, _free_cache_bytes=self._settings.cache_bytes // loaders)
+        vars(own).update(
+            _cache={}, _free_cache_bytes=self._settings.cache_bytes // loaders // self._processes
+        )
         return own
 
     def frame_indices(self, step: int) -> list[int]:

@@ -29,7 +29,9 @@ class TrainingSettings:
         pasted: see `Augmentation`; 0 disables the object bank.
         fewest_points: see `Augmentation`; applies to the objects of the bank too.
         seed: seed of the initial weights, the order of the frames and the augmentation.
-        threads: number of torch threads, on CPU.
+        processes: number of processes that split each batch; at most the frames of a batch are
+            used. The result is that of one process up to the rounding of sums.
+        threads: number of torch threads of each process, on CPU.
         loaders: number of processes that prepare the batches ahead; 0 for none. It does not change
             the result. The processes are started with `multiprocessing`, so a script calls the
             training below `if __name__ == "__main__":`.
@@ -55,6 +57,7 @@ class TrainingSettings:
     pasted: int = 4
     fewest_points: int = 5
     seed: int = 0
+    processes: int = 1
     threads: int = 1
     loaders: int = 0
     device: str = "cpu"
@@ -68,8 +71,8 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         """Raise ConfigError if a setting is out of its range."""
         for name, lowest in (
-            ("steps", 1), ("batch_size", 1), ("threads", 1), ("pasted", 0), ("seed", 0),
-            ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
+            ("steps", 1), ("batch_size", 1), ("processes", 1), ("threads", 1), ("pasted", 0),
+            ("seed", 0), ("fewest_points", 0), ("unlabeled_batch_size", 0), ("statistics_steps", 1),
             ("loaders", 0),
         ):  # fmt: skip
             if getattr(self, name) < lowest:

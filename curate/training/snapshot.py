@@ -13,13 +13,13 @@ from typing import Any
 import torch
 
 from curate.detectors.base import TrainableDetector
-from curate.files.atomic import replace_file
 from curate.training.settings import TrainingSettings
 
 _log = logging.getLogger(__name__)
 
-# Settings that do not change the result.
-_WITHOUT_EFFECT = ("cache_bytes", "loaders", "snapshot_seconds", "statistics_steps")
+# Settings that do not change the result, or only by the rounding of sums (`processes`): a training
+# that ran out of memory may resume with fewer processes.
+_WITHOUT_EFFECT = ("cache_bytes", "loaders", "processes", "snapshot_seconds", "statistics_steps")
 
 
 def fingerprint(
@@ -42,17 +42,15 @@ def snapshot_path(output: Path) -> Path:
     return output.with_name(f".{output.name}.training")
 
 
-def save_snapshot(
-    output: Path,
+def pack_snapshot(
     mark: str,
     networks: Sequence[torch.nn.Module],
     optimizer: torch.optim.Optimizer,
     progress: dict[str, Any],
-) -> None:
-    """Write the state of a training atomically.
+) -> bytes:
+    """Return the content of a snapshot file.
 
     Args:
-        output: the checkpoint that the training will write.
         mark: `fingerprint` of the training.
         networks: the student and, if there is one, its moving average.
         optimizer: optimiser of the student.
@@ -66,34 +64,41 @@ def save_snapshot(
         "progress": progress,
     }
     torch.save(state, buffer)
-    replace_file(snapshot_path(output), buffer.getvalue())
+    return buffer.getvalue()
 
 
-def load_snapshot(
-    output: Path,
-    mark: str,
-    networks: Sequence[torch.nn.Module],
-    optimizer: torch.optim.Optimizer,
-) -> dict[str, Any] | None:
-    """Load the snapshot of a killed training into the networks and return its progress.
+def find_snapshot(output: Path, mark: str) -> bytes | None:
+    """Return the content of the snapshot of a killed training.
 
     Returns None if there is no snapshot, it is damaged, or it is from a training with other labels,
-    other settings or another start. Only tensors and plain values are read from the file.
+    other settings or another start.
     """
     path = snapshot_path(output)
     if not path.exists():
         return None
+    content = path.read_bytes()
     try:
-        content = io.BytesIO(path.read_bytes())
-        state = torch.load(content, map_location="cpu", weights_only=True)
-        matches = state["fingerprint"] == mark
+        matches = _state_in(content)["fingerprint"] == mark
     except (RuntimeError, pickle.UnpicklingError, EOFError, KeyError, TypeError, ValueError):
         _log.warning("%s is damaged; training starts from the beginning", path)
         return None
     if not matches:
         _log.info("%s is from another training; training starts from the beginning", path)
         return None
+    return content
+
+
+def restore_snapshot(
+    content: bytes, networks: Sequence[torch.nn.Module], optimizer: torch.optim.Optimizer
+) -> dict[str, Any]:
+    """Load a snapshot into the networks and the optimiser, and return its progress."""
+    state = _state_in(content)
     for network, weights in zip(networks, state["networks"], strict=True):
         network.load_state_dict(weights)
     optimizer.load_state_dict(state["optimizer"])
     return dict(state["progress"])
+
+
+def _state_in(content: bytes) -> Any:
+    """Return the state in a snapshot; only tensors and plain values are read from it."""
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)

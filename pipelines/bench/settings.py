@@ -26,6 +26,7 @@ FIXED = {
     "run.method": "--methods",
     "train.pretrain_steps": "--teacher-steps",
     "train.round_steps": "--steps",
+    "train.processes": "--workers",
     "train.threads": "--workers",
     "run.rounds": "--rounds",
     "run.seed": "--seeds",

@@ -10,6 +10,7 @@ from pipelines.commands.options import (
     ChartFormatOption,
     ExecutorOption,
     JsonOption,
+    ProcessesOption,
     RoundOption,
     ThreadsOption,
     WorkersOption,
@@ -55,6 +56,7 @@ def audit(
     round_number: RoundOption = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
+    processes: ProcessesOption = None,
     threads: ThreadsOption = None,
     image_format: ChartFormatOption = None,
     workspace: WorkspaceOption = None,
@@ -96,7 +98,7 @@ def audit(
         replicates=replicates,
         **options,
     )
-    opened = open_workspace(workspace, executor, workers, threads)
+    opened = open_workspace(workspace, executor, workers, threads, processes)
     check_names(opened)
     found = run_audit(opened, request, Bar(), (lambda _: None) if as_json else print_report)
     store_audit(opened, found)

@@ -94,10 +94,22 @@ WorkersOption = Annotated[
         "that saves time. Default: run.workers of curate.toml.",
     ),
 ]
+ProcessesOption = Annotated[
+    Optional[Any],  # noqa: UP045
+    typer.Option(
+        "--processes",
+        parser=_worker_count,
+        metavar="N|auto",
+        help="Processes that split each step of a training; auto is one per core or GPU. Default: "
+        "train.processes of curate.toml.",
+    ),
+]
 ThreadsOption = Annotated[
     Optional[int],  # noqa: UP045
     typer.Option(
-        "--threads", min=1, help="Threads of a training; default: train.threads of curate.toml."
+        "--threads",
+        min=1,
+        help="Threads of each process of a training; default: train.threads of curate.toml.",
     ),
 ]
 JsonOption = Annotated[
@@ -128,6 +140,7 @@ def open_workspace(
     executor: str | None = None,
     workers: int | str | None = None,
     threads: int | None = None,
+    processes: int | str | None = None,
     *,
     allow_empty: bool = False,
 ) -> "Workspace":
@@ -143,7 +156,9 @@ def open_workspace(
     if executor is not None:
         changes["executor"] = executor
     workspace = workspace.with_settings("run", **changes)
-    return workspace.with_settings("train", **({"threads": threads} if threads else {}))
+    given = {"threads": threads, "processes": processes}
+    changes = {name: value for name, value in given.items() if value is not None}
+    return workspace.with_settings("train", **changes)
 
 
 def end(reports: Sequence["Report"], *, as_json: bool) -> None:

@@ -4,6 +4,7 @@ from pipelines.commands.dry_run import print_preview
 from pipelines.commands.options import (
     DryRunOption,
     JsonOption,
+    ProcessesOption,
     ThreadsOption,
     WorkspaceOption,
     end,
@@ -13,6 +14,7 @@ from pipelines.reports.terminal import print_report
 
 
 def pretrain(
+    processes: ProcessesOption = None,
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
     dry_run: DryRunOption = False,
@@ -29,7 +31,7 @@ def pretrain(
     from pipelines.engine.runner import run_first
     from pipelines.round import graph_of
 
-    opened = open_workspace(workspace, threads=threads)
+    opened = open_workspace(workspace, threads=threads, processes=processes)
     check_names(opened)
     firsts = list(graph_of(opened).first_stages)
     if not firsts:

@@ -11,6 +11,7 @@ from pipelines.commands.options import (
     DryRunOption,
     JsonOption,
     PolicyOption,
+    ProcessesOption,
     RoundOption,
     ThreadsOption,
     WorkspaceOption,
@@ -39,6 +40,7 @@ def train_round(
             autocompletion=complete(EXPORTERS.classes),
         ),
     ] = None,
+    processes: ProcessesOption = None,
     threads: ThreadsOption = None,
     workspace: WorkspaceOption = None,
     allow_empty: AllowEmptyOption = False,
@@ -59,7 +61,9 @@ def train_round(
     """
     given = {"command": command, "labels_format": labels_format}
     changes = {name: value for name, value in given.items() if value is not None}
-    opened = open_workspace(workspace, threads=threads, allow_empty=allow_empty)
+    opened = open_workspace(
+        workspace, threads=threads, processes=processes, allow_empty=allow_empty
+    )
     opened = opened.with_settings("train", **changes)
     run_round_command("train-round", opened, round_number, policy, as_json=as_json, dry_run=dry_run)
     if dry_run:

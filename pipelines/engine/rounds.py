@@ -114,7 +114,7 @@ def _recorded_config(workspace: Workspace) -> str:
         "run": {"executor", "workers", "database"},
         "detector": {"batch_size", "workers", "timeout_s"},
         "segmenter": {"cache", "cache_limit"},
-        "train": {"threads"},
+        "train": {"loaders", "processes", "threads"},
     }
     return json.dumps(workspace.config.model_dump(mode="json", exclude=exclude))
 

@@ -24,8 +24,8 @@ from pipelines.stages.train_round import (
 from pipelines.workspace.workspace import Workspace
 
 _LATER_SETTINGS = {  # settings without effect on the first training
-    "round_steps", "round_learning_rate", "unlabeled_batch_size", "threads", "start",
-    "loaders", "zero_weight", "teacher", "ema_decay", "command", "labels_format",
+    "round_steps", "round_learning_rate", "unlabeled_batch_size", "processes", "threads",
+    "start", "loaders", "zero_weight", "teacher", "ema_decay", "command", "labels_format",
     "statistics_steps",
 }  # fmt: skip
 
@@ -96,7 +96,7 @@ def run(workspace: Workspace, progress: Progress) -> Product:
     config, path, labels = workspace.config, file(workspace), _labels(workspace)
     write_label_file(workspace, labels, 0, "")
     report = train_with_progress(
-        trained_detector(config).detector,
+        workspace,
         labels=labels,
         output=path,
         settings=training_settings(
@@ -107,7 +107,7 @@ def run(workspace: Workspace, progress: Progress) -> Product:
             METHODS["baseline"],
         ),
         start=None,
-        read=workspace.dataset.read,
+        frames=config.train.batch_size,
         progress=progress,
     )
 

@@ -1,13 +1,13 @@
 """train-round: train the student from the exported labels and the teacher."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection
 
+from curate.datasets.base import Dataset
 from curate.detectors.devices import AUTO, choose_device
 from curate.detectors.precision import FLOAT32
 from curate.errors import ConfigError, one_line
@@ -29,11 +29,12 @@ from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally, trainer_command
 from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.stages.vanished import check_labels
-from pipelines.workspace.config import TrainSection
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.config import Config, TrainSection
+from pipelines.workspace.workspace import Workspace, open_dataset
 
 if TYPE_CHECKING:
-    from curate.detectors.base import TrainableDetector
+    from collections.abc import Sequence
+
     from curate.training.settings import Statistic, TrainingReport, TrainingSettings
 
 MOST_LOADERS = 8
@@ -51,6 +52,7 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
             exclude={
                 "pretrain_steps",
                 "learning_rate",
+                "processes",
                 "threads",
                 "loaders",
                 "ema_decay",
@@ -142,7 +144,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         )
     section = workspace.config.train
     report = train_with_progress(
-        trainable.detector,
+        workspace,
         labels=export.file(workspace, job.context, job.policy),
         output=path,
         settings=training_settings(
@@ -153,7 +155,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
             method_of(workspace.config, job.policy),
         ),
         start=job.context.teacher.path if section.start == "teacher" else None,
-        read=workspace.dataset.read,
+        frames=section.batch_size + section.unlabeled_batch_size,
         progress=progress,
     )
     statistics += report.statistics
@@ -211,6 +213,7 @@ def training_settings(
         "batch_size": section.batch_size,
         "unlabeled_batch_size": section.unlabeled_batch_size,
         "learning_rate": learning_rate,
+        "processes": 1,  # decided when the training begins
         "threads": section.threads,
         "pasted": section.pasted,
         "teacher": method.teacher,
@@ -234,22 +237,67 @@ def training_settings(
 
 
 def train_with_progress(
-    detector: "type[TrainableDetector]",
+    workspace: Workspace,
     *,
     labels: Path,
     output: Path,
     settings: "TrainingSettings",
     start: Path | None,
-    read: Callable[[str], Frame],
+    frames: int,
     progress: Progress,
 ) -> "TrainingReport":
-    """Train a detector, and show the number of steps and the loss as progress."""
-    from curate.training.trainer import train
+    """Train the configured detector, and show the number of steps and the loss as progress.
 
+    Args:
+        workspace: the workspace.
+        labels: see `curate.training.trainer.train`.
+        output: see there.
+        settings: see there; the number of processes is decided here.
+        start: see there.
+        frames: frames per step, at most.
+        progress: shows the steps.
+    """
+    from curate.training.trainer import train
+    from pipelines.engine.training import plan_training
+
+    config = workspace.config
+    processes, launch = plan_training(config, settings.steps, frames, settings.device)
     with progress.track(output.stem, settings.steps) as advance:
         reach = as_total(advance)
 
         def show(step: int, steps: int, loss: float) -> None:
             reach(step, steps, f"loss {loss:.2f}")
 
-        return train(detector, labels, output, settings, start=start, read=read, progress=show)
+        return train(
+            trained_detector(config).detector,
+            labels,
+            output,
+            replace(settings, processes=processes),
+            start=start,
+            read=FrameReader(config, workspace.dataset),
+            progress=show,
+            launch=launch,
+        )
+
+
+class FrameReader:
+    """Reads the frames of a data set; another process that it is sent to opens the data set anew.
+
+    Args:
+        config: the configuration.
+        dataset: the open data set; None to open it for the first frame.
+    """
+
+    def __init__(self, config: Config, dataset: Dataset | None = None) -> None:
+        self._config = config
+        self._dataset = dataset
+
+    def __call__(self, frame_id: str) -> Frame:
+        """Return the frame."""
+        if self._dataset is None:
+            self._dataset = open_dataset(self._config)
+        return self._dataset.read(frame_id)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes the same reader in another process."""
+        return type(self), (self._config,)

@@ -476,8 +476,17 @@ class TrainSection(Section):
         description="Peak learning rate of the students.",
         json_schema_extra=_unit("1"),
     )
+    processes: AtLeastOne | Literal["auto"] = Field(
+        default=1,
+        description="Processes that split the frames of each step. 'auto' is one per core or GPU. "
+        "At most one per frame of a step is used. The result is that of one process up to the "
+        "rounding of sums; see docs/training.md.",
+        json_schema_extra=_unit("processes"),
+    )
     threads: AtLeastOne = Field(
-        default=1, description="CPU threads of a training.", json_schema_extra=_unit("threads")
+        default=1,
+        description="CPU threads of each process of a training.",
+        json_schema_extra=_unit("threads"),
     )
     loaders: Count | Literal["auto"] = Field(
         default="auto",

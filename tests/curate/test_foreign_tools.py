@@ -1,8 +1,7 @@
 """Readers of other projects accept curate's files; each test is skipped if its project is missing.
 
-Most of their dependencies are not needed: `pip install --no-deps pycocotools nuscenes-devkit
-labelCloud datumaro orjson attrs mmengine addict termcolor yapf pyquaternion`. Parts that need a
-display or CUDA are replaced by stubs.
+Most of their dependencies are not needed: `pip install --no-deps -r .ci/foreign-tools.txt`. Parts
+that need a display or CUDA are replaced by stubs.
 """
 
 import importlib.util
@@ -27,6 +26,7 @@ from curate.exporters.nuscenes import NuScenesExporter
 from curate.frames import Frame
 from curate.review.editors.cvat import CvatEditor
 from curate.review.editors.labelcloud import LabelCloudEditor
+from curate.simulation import open3d_loader
 
 
 def foreign(name: str):
@@ -135,6 +135,7 @@ def test_labelcloud_opens_an_exported_review(tmp_path, stubbed, monkeypatch):
         pytest.skip("labelCloud is not installed")
     settings = Path(installed.origin).parent / "resources" / "default_config.ini"
     importlib.import_module("pkg_resources").resource_filename.return_value = settings
+    open3d_loader.load()  # labelCloud imports open3d, which may miss a library of the system
     monkeypatch.chdir(tmp_path)
     sheet = small_sheet("labelcloud")
     LabelCloudEditor().write(tmp_path, sheet, read)

@@ -22,19 +22,23 @@ def usable_cores() -> int:
     return cores or 1
 
 
-def affordable_workers(workers: int) -> int:
+def affordable_workers(workers: int, needed: int | None = None) -> int:
     """Return how many workers the free memory allows, at least 1 and at most `workers`.
 
-    A worker is expected to need as much memory as this process, which has a model loaded. Where the
-    system does not report its memory, all workers are allowed.
+    Where the system does not report its memory, all workers are allowed.
+
+    Args:
+        workers: number of workers.
+        needed: bytes that a worker needs; by default as many as this process, which has a model
+            loaded.
     """
-    free, needed = _free_memory(), _entry(_STATUS, "VmRSS:")
+    free, needed = _free_memory(), needed or _entry(_STATUS, "VmRSS:")
     if not free or not needed:
         return workers
     allowed = max(1, min(workers, int(free * _MEMORY_SHARE / needed)))
     if allowed < workers:
         _log.warning(
-            "%d of %d workers: each needs about %d MiB, and %d MiB are free",
+            "%d of %d processes: each needs about %d MiB, and %d MiB are free",
             *(allowed, workers, needed >> 20, free >> 20),
         )
     return allowed

@@ -6,13 +6,16 @@ its rows. Every node needs the same version of curate, and the data set at the s
 
 import os
 import pickle
+import socket
 import sys
 import time
+import weakref
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
-from curate.errors import ConfigError, CurateError, one_line
+from curate.errors import ConfigError, CurateError, DataError, one_line
 from pipelines.engine.executors.base import (
     JOBS_PER_WORKER,
     FunctionHolder,
@@ -57,17 +60,18 @@ class RayExecutor:
         start_timeout_s: float = 120.0,
     ) -> None:
         self.start_timeout_s = start_timeout_s
-        self._ray = _import_ray()
+        self._ray = import_ray()
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus}
         self._owns_cluster = not self._ray.is_initialized()
         if self._owns_cluster:
-            _join(self._ray, address, workers or 1)
-        self.workers = workers or self._places()
+            join_cluster(self._ray, address, workers or 1)
+        self.workers = workers or places(self._ray, self._needs)
         # Ray must not restart a crashed actor: the executor replaces it by a new one, and so knows
         # which frame it was processing.
         options = {**self._needs, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
         self._actor_class = self._ray.remote(**options)(RemoteHolder)
         self._actors: list[_Actor] = []
+        _executors.add(self)
 
     def map(self, function: JobFunction, jobs: Iterable[Job]) -> Iterator[Outcome]:
         """Yield one outcome per frame or sequence, in the order in which they end.
@@ -93,20 +97,16 @@ class RayExecutor:
             for actor in [actor for actor in self._actors if actor.results]:
                 self._dismiss(actor)
 
-    def _places(self) -> int:
-        """Return for how many actors the cluster has resources, at least 1."""
-        offered, names = self._ray.cluster_resources(), {"num_cpus": "CPU", "num_gpus": "GPU"}
-        places = [
-            int(offered.get(names[key], 0) / need) for key, need in self._needs.items() if need
-        ]
-        return max(1, min(places, default=1))
-
     def close(self) -> None:
         """End the actors, and the cluster if it was started here."""
-        for actor in list(self._actors):
-            self._dismiss(actor)
+        self.free_resources()
         if self._owns_cluster:
             self._ray.shutdown()
+
+    def free_resources(self) -> None:
+        """End the actors; the next `map` starts new ones."""
+        for actor in list(self._actors):
+            self._dismiss(actor)
 
     def _dispatch(self, packed: bytes, queue: JobQueue, workers: int) -> bool:
         """Send jobs to the actors that have loaded their models; return whether any are left."""
@@ -167,6 +167,11 @@ class RemoteHolder(FunctionHolder):
         # The actor must find the same user modules as the driver.
         sys.path += [path for path in search_path if path not in sys.path]
 
+    def open(self, packed: bytes) -> CurateError | None:
+        """Load a function as `FunctionHolder.open`; an error in the data set names the node."""
+        error = super().open(packed)
+        return on_this_node(error) if isinstance(error, DataError) else error
+
     def place(self) -> None:
         """Do nothing; the call returns once the cluster has placed the actor."""
 
@@ -198,7 +203,22 @@ class _Actor:
         self.results.append(self.handle.work.remote(job))
 
 
-def _import_ray() -> Any:
+# The executors of this process. Idle actors keep their CPUs, which a training needs.
+_executors: "weakref.WeakSet[RayExecutor]" = weakref.WeakSet()
+
+
+def free_resources() -> None:
+    """End the actors of all executors of this process, so that other work finds room."""
+    for executor in list(_executors):
+        executor.free_resources()
+
+
+def import_ray() -> Any:
+    """Return the package `ray`.
+
+    Raises:
+        ConfigError: if it is not installed.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
@@ -210,8 +230,41 @@ def _import_ray() -> Any:
     return ray
 
 
-def _join(ray: Any, address: str | None, workers: int) -> None:
-    """Join a cluster, or start one with at least one CPU per worker."""
+def on_this_node(error: DataError) -> DataError:
+    """Return an error in the data set with the node on which it was found, and what to do."""
+    return DataError(
+        f"{error} (on node {socket.gethostname()}; every node of a Ray cluster needs the data set "
+        "at the same path)"
+    )
+
+
+@contextmanager
+def joined(address: str | None, workers: int) -> Iterator[Any]:
+    """Yield the package `ray` in a cluster: the one that this process is in, or else a new one."""
+    ray = import_ray()
+    joins = not ray.is_initialized()
+    if joins:
+        join_cluster(ray, address, workers)
+    try:
+        yield ray
+    finally:
+        if joins:
+            ray.shutdown()
+
+
+def places(ray: Any, needs: Mapping[str, float]) -> int:
+    """Return for how many workers with these needs the cluster has resources, at least 1."""
+    offered, names = ray.cluster_resources(), {"num_cpus": "CPU", "num_gpus": "GPU"}
+    found = [int(offered.get(names[key], 0) / need) for key, need in needs.items() if need]
+    return max(1, min(found, default=1))
+
+
+def join_cluster(ray: Any, address: str | None, workers: int) -> None:
+    """Join a cluster, or start one with at least one CPU per worker.
+
+    Raises:
+        CurateError: if that is not possible.
+    """
     address = address or os.environ.get("RAY_ADDRESS")
     options: dict[str, Any] = (
         {"address": address}

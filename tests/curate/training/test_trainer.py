@@ -17,9 +17,9 @@ from curate.errors import ConfigError, DataError, ModelError
 from curate.geometry.overlap import iou_3d
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
+from curate.training.loop import one_cycle
 from curate.training.settings import TrainingSettings
 from curate.training.snapshot import snapshot_path
-from curate.training.trainer import one_cycle
 from curate.training.trainer import train as train_detector
 
 

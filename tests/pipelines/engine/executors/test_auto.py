@@ -95,7 +95,7 @@ def test_memory_bounds_the_number_of_workers(
     assert machine.affordable_workers(3) == 3
     with caplog.at_level(logging.WARNING):
         assert machine.affordable_workers(8) == 3
-    assert "3 of 8 workers: each needs about 1024 MiB, and 4096 MiB are free" in caplog.text
+    assert "3 of 8 processes: each needs about 1024 MiB, and 4096 MiB are free" in caplog.text
     (tmp_path / "memory.max").write_text(str(3 << 30))
     (tmp_path / "memory.current").write_text(str(2 << 30))
     (tmp_path / "memory.stat").write_text(f"anon {1 << 30}\nfile {1 << 30}\n")
