@@ -110,8 +110,8 @@ def check(workspace: Workspace, policy: str) -> None:
     config = workspace.config
     check_policy(config, policy)
     if config.train.command is not None:
-        trainer_command(config.train.command)
         check_labels_format(config, workspace.dataset)
+        trainer_command(config.train.command)
     elif trainable_detector(config):
         section, method = config.train, method_of(config, policy)
         training_settings(workspace, section.round_steps, section.round_learning_rate, 1, method)
