@@ -260,7 +260,9 @@ def why_maps_are_not_stored(config: Config) -> str:
         return "segmenter.name is 'none'"
     if section.cache is None or section.cache_limit == 0:
         return "segmenter.cache_limit is 0"
-    if registry.SEGMENTERS.declared(name, "map_version") is None:
+    with error_prefix("segmenter.name"):
+        version = registry.SEGMENTERS.declared(name, "map_version")
+    if version is None:
         return (
             f"the maps of segmenter '{name}' are not stored: they are files already, or depend on "
             "more than the image (its class declares no map_version)"
@@ -269,8 +271,15 @@ def why_maps_are_not_stored(config: Config) -> str:
 
 
 def stores_maps(config: Config) -> bool:
-    """Return whether the maps of the configured segmenter are stored."""
-    return not why_maps_are_not_stored(config)
+    """Return whether the maps of the configured segmenter are stored.
+
+    A class that cannot be imported stores none: `status` works without it, and every stage that
+    segments reports it.
+    """
+    try:
+        return not why_maps_are_not_stored(config)
+    except ConfigError:
+        return False
 
 
 def open_map_store(config: Config) -> MapStore:
