@@ -73,6 +73,10 @@ class CellsFailed(CurateError):  # noqa: N818 - named after the cells, not after
     exit_code = 9
 
 
+class ProcessDied(CurateError):  # noqa: N818 - named after the process, not after an error
+    """A process of the training was killed; the training can resume from its last snapshot."""
+
+
 class TrainerFailed(CurateError):  # noqa: N818 - it reports another program's failure
     """The user's trainer ended with an error, or without a checkpoint."""
 

@@ -70,14 +70,15 @@ def detector_place(config: Config) -> ModelPlace | None:
         registry.DETECTORS.takes(section.name, argument) for argument in ("device", "providers")
     )
     if in_runtime and section.providers != AUTO:
-        return ModelPlace(providers=section.providers, options=section.provider_options)
+        return ModelPlace(providers=section.providers, options=section.provider_options or {})
     if in_torch:
         device = choose_device(section.device)
         in_runtime = in_runtime and device == CPU.name and section.precision == FLOAT32
         return ModelPlace(providers=CPU.name) if in_runtime else ModelPlace(device)
     if in_runtime:
         with error_prefix("detector.device"):
-            return ModelPlace(None, *providers_of_device(section.device, section.provider_options))
+            found = providers_of_device(section.device, section.provider_options or {})
+            return ModelPlace(None, *found)
     return None
 
 
@@ -87,7 +88,7 @@ def segmenter_place(config: Config) -> ModelPlace | None:
     name = "onnx" if section.name == "simulated" else section.name
     if name == "none" or not registry.SEGMENTERS.takes(name, "providers"):
         return None
-    return ModelPlace(providers=section.providers, options=section.provider_options)
+    return ModelPlace(providers=section.providers, options=section.provider_options or {})
 
 
 def check_detector_place(config: Config) -> None:

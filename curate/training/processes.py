@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 from torch import cuda, distributed
 
-from curate.errors import ConfigError, CurateError, ModelError, one_line
+from curate.errors import ConfigError, CurateError, ModelError, ProcessDied, one_line
 from curate.training.loop import Message, Place, Report, Trained, TrainingJob, run_steps
 from curate.training.shared_sums import SharedSums
 
@@ -38,10 +38,6 @@ if TYPE_CHECKING:
 TIMEOUT = timedelta(minutes=10)
 # An error of one process may follow from the death of another, which is then seen within this time.
 _GRACE_S = 2.0
-
-
-class ProcessDied(CurateError):  # noqa: N818 - named after the process, not after an error
-    """A process of the training was killed; the training can resume from its last snapshot."""
 
 
 Launch = Callable[[TrainingJob, int, Report], None]

@@ -11,7 +11,7 @@ import torch
 
 from curate.detectors.base import Student, TrainableDetector, choose_preset
 from curate.detectors.devices import check_device
-from curate.errors import ConfigError, CurateError
+from curate.errors import ConfigError, CurateError, ProcessDied
 from curate.files.atomic import replace_file
 from curate.files.paths import StrPath
 from curate.frames import Frame
@@ -26,7 +26,7 @@ from curate.training.loop import (
     TrainingJob,
     run_steps,
 )
-from curate.training.processes import Launch, ProcessDied, run_in_processes
+from curate.training.processes import Launch, run_in_processes
 from curate.training.settings import TrainingReport, TrainingSettings
 from curate.training.snapshot import find_snapshot, fingerprint, snapshot_path
 

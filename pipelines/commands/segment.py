@@ -7,10 +7,11 @@ from pipelines.commands.options import (
     SplitOption,
     WorkersOption,
     WorkspaceOption,
+    end,
     open_workspace,
 )
 from pipelines.commands.stages import run_frame_command
-from pipelines.reports.terminal import print_json, print_line
+from pipelines.reports.terminal import print_line
 
 
 def segment(
@@ -29,17 +30,17 @@ def segment(
     Example: curate segment --split unlabeled
     """
     from pipelines.assembly import why_maps_are_not_stored
+    from pipelines.engine.runner import Report
     from pipelines.round import graph_of
 
     opened = open_workspace(workspace)
     if not any(graph_of(opened).cache_stages):
         reason = why_maps_are_not_stored(opened.config)
-        if as_json:
-            print_json([])
-        else:
-            print_line(
-                f"segment: nothing to do: {reason or 'no source in run.priors reads semantic maps'}"
-            )
+        reason = reason or "no source in run.priors reads semantic maps"
+        report = Report("segment", 0, summary=f"nothing to do: {reason}")
+        if not as_json:
+            print_line(f"segment: {report.summary}")
+        end([report], as_json=as_json)
         return
     run_frame_command(
         ("segment",), workspace, 0, split, executor, workers, as_json=as_json, dry_run=dry_run

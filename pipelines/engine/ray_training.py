@@ -16,9 +16,9 @@ from concurrent.futures import Future, wait
 from threading import Thread
 from typing import Any
 
-from curate.errors import CurateError, DataError, one_line
+from curate.errors import CurateError, DataError, ProcessDied, one_line
 from curate.training.loop import Place, Report, Trained, TrainingJob, run_steps
-from curate.training.processes import TIMEOUT, ProcessDied, packed_job
+from curate.training.processes import TIMEOUT, packed_job
 from pipelines.engine.executors.ray import free_resources, import_ray, joined, on_this_node, places
 
 _POLL_S = 0.2

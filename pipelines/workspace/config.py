@@ -217,9 +217,10 @@ class DetectorSection(Section):
         description="Execution providers of ONNX Runtime for a detector in ONNX, the preferred one "
         "first; each must work. 'auto' takes one that fits the device; see docs/detectors.md.",
     )
-    provider_options: dict[ProviderName, Options] = Field(
-        default={},
-        description="Options of the providers by their names, such as {cuda = {device_id = 1}}.",
+    provider_options: dict[ProviderName, Options] | None = Field(
+        default=None,
+        description="Options of the providers by their names.",
+        examples=[{"cuda": {"device_id": 1}}],
     )
     precision: Precision = Field(
         default="float32",
@@ -294,9 +295,10 @@ class SegmenterSection(Section):
         "one first; each must work. 'auto' takes the best one that is installed and works; see "
         "docs/segmenters.md.",
     )
-    provider_options: dict[ProviderName, Options] = Field(
-        default={},
-        description="Options of the providers by their names, such as {cuda = {device_id = 1}}.",
+    provider_options: dict[ProviderName, Options] | None = Field(
+        default=None,
+        description="Options of the providers by their names.",
+        examples=[{"cuda": {"device_id": 1}}],
     )
     rename: Rename = Field(
         default=None,

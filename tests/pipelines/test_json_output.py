@@ -46,6 +46,8 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
         "status": there,
         "doctor": there,
         "pretrain": there,
+        "segment": there,
+        "augment": (root / "copies", *there),
         "predict": there,
         "repredict": there,
         "score": there,

@@ -16,9 +16,8 @@ from support.process_tree import descendants, environment
 
 from curate.detectors.base import TrainableDetector
 from curate.detectors.pillars import PillarDetector
-from curate.errors import CurateError, DataError, ModelError
+from curate.errors import CurateError, DataError, ModelError, ProcessDied
 from curate.training.loop import TrainingJob
-from curate.training.processes import ProcessDied
 from curate.training.settings import TrainingReport, TrainingSettings
 from curate.training.snapshot import snapshot_path
 from curate.training.trainer import train

@@ -34,7 +34,7 @@ def write_manifest(folder: Path, views: tuple[Similarity, ...], **more) -> Manif
     """Write the manifest of copies of one frame, and the folders of its views."""
     drawn = AugmentedViews(views=len(views))
     values = {"rotation_y": "openpcdet", "frames": {FRAME: views}} | more
-    manifest = Manifest("unlabeled", drawn, False, "kitti", "x", "kitti", **values)
+    manifest = Manifest("unlabeled", drawn, False, "kitti", {"000000": "x"}, "kitti", **values)
     manifest.write(folder)
     for view in range(len(views)):
         view_folder(view, folder).mkdir()
