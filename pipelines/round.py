@@ -44,6 +44,7 @@ _SEGMENT = (
         function=segment.function,
         check=segment.check,
         refusal=segment.refusal,
+        prepare=segment.prepare,
     ),
 )
 _DETECT = (

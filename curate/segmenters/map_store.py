@@ -15,9 +15,12 @@ import gzip
 import hashlib
 import json
 import os
+import shutil
 import time
+import uuid
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,6 +42,9 @@ _LONGEST_HEADER = 1 << 16
 # Other processes write into the folder, too, so its files are counted again and again; in between
 # passes this many times the time that the counting took.
 _PAUSE = 20
+# No map is stored on a disk with less free space, so that other files of the run still fit.
+_SPARE_BYTES = 1 << 24
+_DESCRIPTION = "segmenter.json"
 _NOT_STORED = "maps that are not there are made again each time they are needed"
 
 
@@ -95,7 +101,7 @@ class MapStore:
         if not reason:
             content = self._pack(image, semantic_map)
             try:
-                self._describe()
+                self.prepare()
                 replace_file(self.path(image), content)
                 self._bytes += len(content)
             except OSError as error:
@@ -112,9 +118,33 @@ class MapStore:
                 "segmenters that you no longer use (segmenter.json in each says which one)"
             )
         existing = next(each for each in (self.folder, *self.folder.parents) if each.exists())
+        if not existing.is_dir():
+            return f"{existing}: not a folder; set segmenter.cache to a folder for semantic maps"
         if not os.access(existing, os.W_OK):
             return f"{existing}: no permission to store semantic maps"
+        if shutil.disk_usage(existing).free < _SPARE_BYTES:
+            return f"{existing}: no space left for semantic maps; free some, or set segmenter.cache"
         return ""
+
+    def identity(self) -> str:
+        """Return the random name of the segmenter's folder, given by `prepare`; "" if it is gone.
+
+        It tells whether maps that were stored once are still there.
+        """
+        try:
+            found = json.loads((self.folder / _DESCRIPTION).read_text()).get("folder")
+        except (OSError, ValueError, AttributeError):
+            return ""
+        return str(found or "")
+
+    def prepare(self) -> None:
+        """Make the segmenter's folder, with a file for people that says what made its maps."""
+        if self.identity() or self.refusal():
+            return
+        content = {"folder": uuid.uuid4().hex, **self.made_by}
+        text = json.dumps(content, sort_keys=True, default=str, indent=2)
+        with suppress(OSError):  # then no map can be stored either, and a warning says so
+            replace_file(self.folder / _DESCRIPTION, f"{text}\n".encode())
 
     def _used_bytes(self) -> int:
         """Return the size of all maps in the folder, of all segmenters."""
@@ -124,13 +154,6 @@ class MapStore:
             end = time.monotonic()
             self._count_at = end + _PAUSE * (end - start)
         return self._bytes
-
-    def _describe(self) -> None:
-        """Write down what made the maps of the folder, for people."""
-        path = self.folder / "segmenter.json"
-        if not path.exists():
-            text = json.dumps(self.made_by, sort_keys=True, default=str, indent=2)
-            replace_file(path, f"{text}\n".encode())
 
     def _pack(self, image: str, semantic_map: SemanticMap) -> bytes:
         """Return the content of a map's file."""
@@ -230,10 +253,12 @@ class StoringSegmenter(Segmenter):
 
 
 def _size(folder: Path) -> int:
-    """Return the bytes of all files in a folder and its subfolders."""
+    """Return the bytes of all maps in a folder and its subfolders."""
     total = 0
     for parent, _, names in os.walk(folder):
         for name in names:
+            if not name.endswith(".gz"):
+                continue
             try:
                 total += (Path(parent) / name).stat().st_size
             except FileNotFoundError:  # another process has just renamed it

@@ -27,7 +27,7 @@ from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
-from pipelines.engine.runner import Report, open_executor, run_first, run_frames
+from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
 from pipelines.labels.evidence import read_evidence
 from pipelines.round import graph_of, open_plan
@@ -226,6 +226,7 @@ def _audited_splits(
 
 def _run_stages(plan: Plan, split: str, progress: Progress, done: ReportCallback) -> set[str]:
     """Run every frame stage and return the frames that failed in any of them."""
+    check_inputs(plan, plan.graph.frames_stages, split)
     failed: set[str] = set()
     with open_executor(plan.workspace) as executor:
         for stage in plan.graph.frames_stages:

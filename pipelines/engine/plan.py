@@ -194,7 +194,14 @@ class Plan:
         return 0 if isinstance(stage, CacheStage) else self.context.number
 
     def fingerprint(self, stage: FramesStage) -> str:
-        """Return the current fingerprint of a stage of frames."""
+        """Return the current fingerprint of a stage of frames.
+
+        That of a cache is computed each time: it changes when the stage makes its folder.
+        """
+        if isinstance(stage, CacheStage):
+            return _fingerprint(
+                stage.name, stage.settings(self.workspace, self.context), stage.reads, self._sources
+            )
         return self._of_frames[stage.name]
 
     def waiting_frames(

@@ -149,7 +149,7 @@ class _FramesStage(_Stage):
             its reusable measurements.
         check: check of its settings before the first frame; raises an error.
         ready: check of the input of a split in a round before the first frame; raises an error.
-        prepare: function that creates the tables it writes to, if they are missing.
+        prepare: function that creates the tables or the folder it writes to, if missing.
     """
 
     settings: Callable[[Workspace, RoundContext], Settings]

@@ -53,8 +53,14 @@ class Segment(ReadsAhead):
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> dict[str, Any]:
-    """Return what the maps depend on besides the images."""
-    return made_by(workspace.config)
+    """Return what the maps depend on besides the images, and the folder that contains them."""
+    folder = open_map_store(workspace.config).identity()
+    return {**made_by(workspace.config), "folder": folder}
+
+
+def prepare(workspace: Workspace) -> None:
+    """Make the folder of the maps; if it was deleted, all maps are waiting again."""
+    open_map_store(workspace.config).prepare()
 
 
 def function(workspace: Workspace, _context: RoundContext) -> Segment:

@@ -10,9 +10,10 @@ data set's own layout. The command writes results in any format of `curate.detec
 """
 
 import inspect
+import re
 import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -255,15 +256,17 @@ class CommandDetector:
         for key, value in self._results.items():
             if isinstance(value, str):
                 options[key] = fill(value, values)
-        return RecordedDetector(
-            _result_path(Path(values["results"]), options.pop("path", None), copies),
-            self._minimum_score,
-            frame_ids=tuple(copies),
-            only_these=True,
-            calibration=lambda frame_id: self._calibration(frame_id, copies[frame_id]),
-            wants_views=False,
-            **options,
-        )
+        path = _result_path(Path(values["results"]), options.pop("path", None), copies)
+        with _own_options():
+            return RecordedDetector(
+                path,
+                self._minimum_score,
+                frame_ids=tuple(copies),
+                only_these=True,
+                calibration=lambda frame_id: self._calibration(frame_id, copies[frame_id]),
+                wants_views=False,
+                **options,
+            )
 
     def _calibration(self, frame_id: str, similarity: Similarity | None) -> Calibration:
         """Return the calibration of a copy, with the meaning of rotation_y in its results."""
@@ -278,7 +281,23 @@ def _moved(found: Detections | CurateError, folder: Path, kept: Path) -> Detecti
     """Return an error that refers to the folder that was kept."""
     if isinstance(found, Detections):
         return found
-    return type(found)(str(found).replace(str(folder), str(kept)))
+    return type(found)(_renamed(str(found).replace(str(folder), str(kept))))
+
+
+def _renamed(message: str) -> str:
+    """Return a message of the reader of results with its options named as they are set here."""
+    return re.sub(
+        r"detector\.options\.(?!results|command|files)", "detector.options.results.", message
+    )
+
+
+@contextmanager
+def _own_options() -> Iterator[None]:
+    """Name the options of the reader of results in its errors as they are set here."""
+    try:
+        yield
+    except CurateError as error:
+        raise type(error)(_renamed(str(error))) from error
 
 
 def _check_command(command: UserCommand) -> None:
@@ -312,7 +331,8 @@ def _check_results(results: Mapping[str, Any]) -> None:
             raise ConfigError(
                 f"detector.options.results has no '{key}'{hint}; it has {', '.join(known)}"
             )
-    check_kind(results.get("kind", "auto"))
+    with _own_options():
+        check_kind(results.get("kind", "auto"))
     pattern = results.get("path", ".")
     if not isinstance(pattern, str) or Path(pattern).is_absolute():
         raise ConfigError(

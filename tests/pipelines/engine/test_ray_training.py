@@ -17,6 +17,7 @@ from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import CurateError, DataError
 from curate.training.settings import TrainingReport, TrainingSettings
 from curate.training.trainer import train
+from pipelines.assembly import Place
 from pipelines.engine.executors.base import FrameJob
 from pipelines.engine.executors.ray import RayExecutor
 from pipelines.engine.ray_training import RayTraining
@@ -95,7 +96,9 @@ def test_frames_without_the_data_set_end_the_run_at_the_start(
     monkeypatch.chdir(tmp_path)
     document = {"dataset": {"root": "/proc/self/cwd/kitti"}}
     executor = RayExecutor(1)
-    function = Predict(make_config(document, "test"), tmp_path / "teacher.safetensors")
+    function = Predict(
+        make_config(document, "test"), tmp_path / "teacher.safetensors", Place(tmp_path, 1)
+    )
     with pytest.raises(DataError, match=r"/proc/self/cwd/kitti.*on node .*at the same path"):
         list(executor.map(function, [FrameJob(0, "000000")]))
     executor.close()

@@ -207,9 +207,10 @@ def test_the_stage_is_left_out_where_no_map_is_stored(
 
 
 def test_a_full_folder_ends_the_stage_early_and_loses_nothing(
-    segmented: Workspace, curate: Curate, caplog: pytest.LogCaptureFixture
+    segmented: Workspace, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run goes on without further maps; with a higher limit the stage continues."""
+    monkeypatch.setattr("curate.segmenters.map_store._PAUSE", 0)
     full = segmented.with_settings("segmenter", cache_limit=1e-7)
     done = run(full)
     assert done["segment"] < 6
@@ -223,6 +224,30 @@ def test_a_full_folder_ends_the_stage_early_and_loses_nothing(
     # A map that did not fit while its frame was in work is made by the next stage that reads it.
     assert [each.done for each in run_workspace(trained(segmented), 2) if each.stage == "segment"]
     assert len(maps(segmented)) == 6
+
+
+def test_maps_of_a_deleted_folder_are_made_again(segmented: Workspace, curate: Curate) -> None:
+    """The stage looks at its folder, so that it does not count maps as done that are gone."""
+    assert run(segmented)["segment"] == 6
+    assert run_workspace(segmented)[0].done == 0
+    shutil.rmtree(segmented.root / "maps")
+    assert "would work on 6 frames" in curate("segment", "-w", segmented.root, "--dry-run")[1]
+    assert not (segmented.root / "maps").exists()
+    code, out, _ = curate("segment", "-w", segmented.root)
+    assert (code, len(maps(segmented))) == (0, 6), out
+    assert "0 frames done" in curate("segment", "-w", segmented.root)[1]
+
+
+def test_a_full_disk_ends_the_stage_early(
+    segmented: Workspace, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No frame counts as done, and the rows of the run are complete."""
+    free = shutil.disk_usage(segmented.root)._replace(free=1000)
+    monkeypatch.setattr("curate.segmenters.map_store.shutil.disk_usage", lambda _: free)
+    done = run(segmented)
+    assert (done["segment"], done["semantic"], len(maps(segmented))) == (0, 6, 0)
+    assert "segment ends early" in caplog.text
+    assert "no space left for semantic maps" in caplog.text
 
 
 def test_a_damaged_image_fails_its_frame_alone(segmented: Workspace, curate: Curate) -> None:

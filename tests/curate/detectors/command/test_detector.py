@@ -132,7 +132,7 @@ def test_only_points_in_the_camera_view_are_given_on_request(root: Path, tmp_pat
         ("nothing", "wrote nothing to {results} on frame"),
         ("others", "results for frames that were not requested (000099)"),
         ("twice", "found.csv"),
-        ("percent", "found.csv"),
+        ("percent", "set detector.options.results.sigmoid = true if they are logits"),
     ],
 )
 def test_a_command_that_fails_fails_its_frames_with_one_line(
@@ -249,7 +249,7 @@ def test_results_are_found_by_a_pattern(
         ("", {}, "detector.options.command: is empty; write a program and its arguments"),
         ("sh", {"results": {"kinds": "csv"}}, "has no 'kinds'; did you mean 'kind'?"),
         ("sh", {"results": {"rename": {}}}, "has no 'rename'; set detector.rename"),
-        ("sh", {"results": {"kind": "cvs"}}, "detector.options.kind 'cvs': use one of"),
+        ("sh", {"results": {"kind": "cvs"}}, "detector.options.results.kind 'cvs': use one of"),
         ("sh", {"results": {"path": "/x.pkl"}}, "write a name or pattern within {results}"),
         ("sh", {"files": "model.yaml"}, 'write a list, ["model.yaml"]'),
     ],
