@@ -76,6 +76,12 @@ def kitti_eval_root() -> Path:
 
 
 @pytest.fixture(scope="session")
+def openpcdet_oracle() -> Path:
+    """Return OpenPCDet's own numbers for some of the real KITTI frames, with the checkpoints."""
+    return _shared("CURATE_OPENPCDET_ORACLE", "openpcdet_oracle")
+
+
+@pytest.fixture(scope="session")
 def postgres() -> Iterator[postgres_server.PostgresServer]:
     """Return a PostgreSQL server with a migrated template; skip if PostgreSQL is not installed."""
     reason = postgres_server.unavailable()
