@@ -149,6 +149,17 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
         head_channels=16,
     )
     monkeypatch.setitem(presets.PRESETS, "tiny", preset)
+    from curate.detectors.openpcdet import presets as anchor_presets
+
+    voxel_rcnn = replace(
+        anchor_presets.PRESETS["voxel-rcnn-small"],
+        limits=(0, -16, -3, 32, 16, 1),
+        voxel=(0.2, 0.2, 0.1),
+        channels=(4, 4, 8, 8, 8, 8),
+        layers=((1, 1, 8), (1, 2, 8)),
+        upsampled=((2, 8), (4, 8)),
+    )
+    monkeypatch.setitem(anchor_presets.PRESETS, "tiny", voxel_rcnn)
     return "tiny"
 
 

@@ -23,6 +23,9 @@ CODE = 7
 """Numbers of a box code."""
 # Sizes below this are raised to it before a division or a logarithm.
 _LEAST_SIZE = 1e-5
+# A box is at most 55 times as large as its anchor, and at least 1/55. Only a network that has hardly
+# been trained goes beyond; its boxes would be infinite.
+_MOST_LOG = 4.0
 
 
 def make_anchors(file: ModelFile) -> Float32[np.ndarray, "n 7"]:
@@ -98,8 +101,8 @@ def decode(codes: Tensor, anchors: Tensor) -> Tensor:
     diagonal = torch.sqrt(own[..., :1] ** 2 + own[..., 1:2] ** 2)
     scale = torch.cat([diagonal, diagonal, own[..., 2:]], dim=-1)
     centres = codes[..., :3] * scale + anchors[..., :3]
-    turned = codes[..., 6:] + anchors[..., 6:]
-    return torch.cat([centres, torch.exp(codes[..., 3:6]) * own, turned], dim=-1)
+    sizes = torch.exp(codes[..., 3:6].clamp(-_MOST_LOG, _MOST_LOG)) * own
+    return torch.cat([centres, sizes, codes[..., 6:] + anchors[..., 6:]], dim=-1)
 
 
 def wrap(angles: Tensor, start: float, period: float = 2 * math.pi) -> Tensor:

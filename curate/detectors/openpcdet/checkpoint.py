@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from curate.detectors.openpcdet.network import DetectionNetwork
+from curate.detectors.openpcdet.presets import FORMAT_VERSION
 from curate.detectors.openpcdet.schema import ModelFile, load_model_file, parse_model_file
 from curate.errors import ConfigError, ModelError, first_line
 from curate.files.atomic import replace_file
 
 FORMAT = "curate-openpcdet"
-FORMAT_VERSION = "1"
 # The first sparse convolution has 4 channels in; its weight shows the layout of the whole file.
 _FIRST_SPARSE = "backbone_3d.conv_input.0.weight"
 _MOST_NAMES = 4

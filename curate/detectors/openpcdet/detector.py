@@ -1,16 +1,22 @@
 """PointPillar, SECOND and Voxel R-CNN: checkpoints of OpenPCDet, or trained by curate."""
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from curate.detections import Detections
+from curate.detectors.openpcdet.presets import FORMAT_VERSION, PRESETS
 from curate.errors import ConfigError, DataError, first_line
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.warnings_once import warn_once
+
+if TYPE_CHECKING:
+    from curate.detectors.openpcdet.training import AnchorStudent
 
 # Height of KITTI's LiDAR above the ground in metres. The anchors of the public models fit it.
 MODEL_HEIGHT = 1.73
@@ -39,6 +45,10 @@ class OpenPCDetDetector:
             support, or the device cannot be used.
     """
 
+    presets: ClassVar[Collection[str]] = PRESETS.keys()
+    checkpoint_suffix: ClassVar[str] = ".pth"
+    checkpoint_version: ClassVar[str] = FORMAT_VERSION
+
     def __init__(
         self,
         checkpoint: StrPath,
@@ -66,6 +76,31 @@ class OpenPCDetDetector:
         self._raise_by = MODEL_HEIGHT - lidar_height
         self._height = lidar_height
         self._frames = 0
+
+    @classmethod
+    def check_checkpoint(cls, checkpoint: Path) -> None:
+        """See `curate.detectors.base.TrainableDetector`.
+
+        A checkpoint of OpenPCDet is compared with its model file when it is loaded.
+        """
+        from curate.detectors.openpcdet.checkpoint import load_checkpoint, load_network
+
+        if load_checkpoint(checkpoint).preset is not None:
+            load_network(checkpoint)
+
+    @classmethod
+    def new_student(cls, preset: str, categories: tuple[str, ...]) -> "AnchorStudent":
+        """See `curate.detectors.base.TrainableDetector`."""
+        from curate.detectors.openpcdet.training import AnchorStudent
+
+        return AnchorStudent.new(preset, categories)
+
+    @classmethod
+    def load_student(cls, checkpoint: Path, *, config: StrPath | None = None) -> "AnchorStudent":
+        """See `curate.detectors.base.TrainableDetector`; `config` as in the constructor."""
+        from curate.detectors.openpcdet.training import AnchorStudent
+
+        return AnchorStudent.load(checkpoint, None if config is None else Path(config))
 
     @property
     def categories(self) -> tuple[str, ...]:

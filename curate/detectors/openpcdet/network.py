@@ -133,7 +133,7 @@ class _PointLayer(nn.Module):
     def forward(self, slots: Tensor) -> Tensor:
         """Return (n, 1, channels) maxima, or (n, slots, channels) with the maximum appended."""
         rows = self.norm(self.linear(slots).flatten(0, 1))
-        values = functional.relu(rows).view(*slots.shape[:2], -1)
+        values = functional.relu(rows).view(*slots.shape[:2], rows.shape[1])
         highest = values.amax(dim=1, keepdim=True)
         return highest if self.last else torch.cat([values, highest.expand_as(values)], dim=-1)
 

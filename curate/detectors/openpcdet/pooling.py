@@ -125,5 +125,6 @@ class NearMaximum(torch.autograd.Function):
         gradient = torch.where(empty[:, None], 0.0, gradient)
         index = source * channels + torch.arange(channels, device=source.device)
         flat = gradient.new_zeros(ctx.count * channels)
-        flat.index_add_(0, index.flatten(), gradient.flatten())
+        if ctx.count:
+            flat.index_add_(0, index.flatten(), gradient.flatten())
         return flat.view(-1, channels), None

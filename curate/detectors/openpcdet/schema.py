@@ -447,7 +447,7 @@ class ModelFile(_Section):
 
     def to_text(self) -> str:
         """Return the file as JSON, which is YAML as well."""
-        return self.model_dump_json(by_alias=True, exclude_unset=True)
+        return self.model_dump_json(by_alias=True, exclude_none=True)
 
 
 def load_model_file(path: Path) -> ModelFile:
