@@ -23,8 +23,8 @@ CODE = 7
 """Numbers of a box code."""
 # Sizes below this are raised to it before a division or a logarithm.
 _LEAST_SIZE = 1e-5
-# A box is at most 55 times as large as its anchor, and at least 1/55. Only a network that has hardly
-# been trained goes beyond; its boxes would be infinite.
+# A box is at most 55 times as large as its anchor, and at least 1/55. Only a network that has
+# hardly been trained goes beyond; its boxes would be infinite.
 _MOST_LOG = 4.0
 
 

@@ -6,6 +6,7 @@ OpenPCDet ignores the additional entries.
 """
 
 import io
+import json
 import pickle
 import struct
 import warnings
@@ -212,11 +213,9 @@ def _content(path: Path) -> Mapping[str, Any]:
 
 def _stored_file(path: Path, content: Mapping[str, Any]) -> ModelFile:
     """Return the model file in a checkpoint of curate."""
-    import yaml
-
     try:
-        return parse_model_file(yaml.safe_load(content["config"]), str(path))
-    except (KeyError, TypeError, AttributeError, yaml.YAMLError, ConfigError) as error:
+        return parse_model_file(json.loads(content["config"]), str(path))
+    except (*_DAMAGED, ConfigError) as error:
         raise ModelError(f"{path}: damaged model file: {first_line(error)}; train again") from None
 
 
