@@ -156,5 +156,5 @@ def _check_intensities(frame: Frame) -> None:
     if low < 0 or high > 1:
         raise DataError(
             f"frame {frame.frame_id}: intensities from {low:g} to {high:g}, the detector needs "
-            "[0, 1]; set dataset.options.intensity_scale to the value of full intensity"
+            "[0, 1]; set dataset.intensity_scale to the value of full intensity"
         )
