@@ -13,6 +13,7 @@ from curate.detections import CATEGORIES
 from curate.detectors.base import Sample
 from curate.detectors.openpcdet.anchors import anchor_classes, decode, encode
 from curate.detectors.openpcdet.checkpoint import load_network
+from curate.detectors.openpcdet.inference import detect
 from curate.detectors.openpcdet.loss import anchor_loss, corner_loss, roi_loss
 from curate.detectors.openpcdet.network import Batch
 from curate.detectors.openpcdet.presets import PRESETS, preset_file
@@ -148,6 +149,46 @@ def check_gradients(network, total: torch.Tensor, expected) -> None:
         found = gradient.flatten()[index[index >= 0]]
         limit = ENTRIES * gradient.abs().max().item()
         assert_allclose(found, wanted, rtol=0, atol=limit, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [
+        ("pointpillar", "pointpillar_train"),
+        ("second", "second_train"),
+        ("voxel_rcnn_car", "voxel_rcnn_car_train_b"),
+    ],
+)
+def test_three_steps_equal_openpcdets_optimiser(
+    openpcdet_oracle: Path, kitti_root: Path, name: str, numbers: str
+) -> None:
+    """Adam with decoupled weight decay, its schedule of rate and momentum, clipped gradients."""
+    scene = Scene(openpcdet_oracle, kitti_root, name, numbers)
+    network, expected = scene.network, np.load(openpcdet_oracle / f"{name}_steps.npz")
+    anchors, classes = network.anchors.numpy(), anchor_classes(scene.file)
+    targets = anchor_targets(anchors, classes, scene.file, scene.objects)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=0.01)
+    names = expected["loss_names"].tolist()
+    for step, tolerance in enumerate((1e-5, 2e-3, 1e-2)):
+        optimizer.param_groups[0]["lr"] = float(expected["schedule_lr"][step])
+        optimizer.param_groups[0]["betas"] = (float(expected["schedule_momentum"][step]), 0.99)
+        stage = network(scene.batch)
+        terms = anchor_loss(stage, targets, scene.file.model.dense_head)
+        if scene.file.model.roi_head is not None:
+            given = scene.roi_targets()
+            outputs = network.roi_head(given.rois, given.frames, stage.levels)
+            terms |= roi_loss(*outputs, given, scene.file.model.roi_head)
+        total = torch.stack(list(terms.values())).sum()
+        wanted = expected["losses_per_step"][step]
+        assert total.item() == pytest.approx(wanted[names.index("total")], rel=tolerance)
+        optimizer.zero_grad()
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 10)
+        optimizer.step()
+    parameters = dict(network.named_parameters())
+    norms = [parameters[key].detach().norm() for key in expected["param_names"]]
+    assert_allclose(norms, expected["param_norm_after_3"], rtol=2e-3)
 
 
 def sample(boxes, categories, weights, zero_weight="ignore") -> Sample:
@@ -304,6 +345,37 @@ def test_presets_are_model_files_for_any_known_categories(preset: str) -> None:
     assert file.data_config.grid == grids.get(preset, file.data_config.grid)
     with pytest.raises(ConfigError, match="no anchor for category 'Horse'; there are anchors for"):
         preset_file(preset, ("Car", "Horse"))
+
+
+@pytest.mark.parametrize(
+    "preset",
+    [each if "small" in each else pytest.param(each, marks=pytest.mark.slow) for each in PRESETS],
+)
+def test_every_preset_learns_a_step_and_detects(tmp_path: Path, preset: str) -> None:
+    """The saved checkpoint gives the boxes of the network that was saved."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        student = AnchorStudent.new(preset, CATEGORIES)
+        batch = student.encode([sample([CAR, WALKER], ["Car", "Pedestrian"], [1, 0.5])] * 2, "cpu")
+        optimizer = torch.optim.SGD(student.network.parameters(), lr=1e-3)
+        losses = []
+        for _ in range(2):
+            optimizer.zero_grad()
+            losses.append(student.loss(batch, 2.0)["loss"])
+            losses[-1].backward()
+            optimizer.step()
+    assert losses[1] < losses[0]
+    path = tmp_path / "trained.pth"
+    student.save(path, student.network.state_dict())
+    loaded = AnchorStudent.load(path)
+    assert (loaded.preset, loaded.categories) == (preset, CATEGORIES)
+    for network in (student.network, loaded.network):
+        network.eval()
+    expected, found = (
+        detect(each, sweep(), 0.0, "0") for each in (student.network, loaded.network)
+    )
+    assert len(found) > 0
+    assert np.array_equal(found.boxes, expected.boxes)
 
 
 def document_of(file) -> dict:
