@@ -184,6 +184,7 @@ DETECTORS = Registry(
     "curate.detectors.base:Detector",
     {
         "pillars": "curate.detectors.pillars:PillarDetector",
+        "openpcdet": "curate.detectors.openpcdet:OpenPCDetDetector",
         "onnx": "curate.detectors.onnx:OnnxDetector",
         "recorded": "curate.detectors.recorded:RecordedDetector",
         "command": "curate.detectors.command:CommandDetector",

@@ -76,6 +76,12 @@ def kitti_eval_root() -> Path:
 
 
 @pytest.fixture(scope="session")
+def openpcdet_oracle() -> Path:
+    """Return OpenPCDet's own numbers for some of the real KITTI frames, with the checkpoints."""
+    return _shared("CURATE_OPENPCDET_ORACLE", "openpcdet_oracle")
+
+
+@pytest.fixture(scope="session")
 def postgres() -> Iterator[postgres_server.PostgresServer]:
     """Return a PostgreSQL server with a migrated template; skip if PostgreSQL is not installed."""
     reason = postgres_server.unavailable()
@@ -143,6 +149,17 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> str:
         head_channels=16,
     )
     monkeypatch.setitem(presets.PRESETS, "tiny", preset)
+    from curate.detectors.openpcdet import presets as anchor_presets
+
+    voxel_rcnn = replace(
+        anchor_presets.PRESETS["voxel-rcnn-small"],
+        limits=(0, -16, -3, 32, 16, 1),
+        voxel=(0.2, 0.2, 0.1),
+        channels=(4, 4, 8, 8, 8, 8),
+        layers=((1, 1, 8), (1, 2, 8)),
+        upsampled=((2, 8), (4, 8)),
+    )
+    monkeypatch.setitem(anchor_presets.PRESETS, "tiny", voxel_rcnn)
     return "tiny"
 
 

@@ -157,7 +157,8 @@ class Student(Protocol):
     every step. For a training on several processes a student is pickled.
 
     Attributes:
-        preset: name of the preset that the network was built from.
+        preset: name of the preset that the network was built from; empty if it was built from
+            something else, such as a model file of the user: every preset fits then.
         categories: categories that it detects, in the order of its outputs.
         network: on CPU at first; the trainer moves it to the training device.
     """
@@ -231,6 +232,9 @@ class TrainableDetector(Detector, Protocol):
     @classmethod
     def load_student(cls, checkpoint: Path) -> Student:
         """Return a student that continues from a checkpoint.
+
+        Keyword arguments may follow, with names of the constructor's options: those that the user
+        has set are passed.
 
         Raises:
             ModelError: as in `check_checkpoint`.

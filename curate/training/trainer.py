@@ -1,10 +1,12 @@
 """Training of a detector on labeled frames and weighted pseudo-labels (Eqs. 6 and 10)."""
 
+import inspect
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,6 +48,7 @@ def train(
     settings: TrainingSettings,
     *,
     start: StrPath | None = None,
+    options: Mapping[str, Any] | None = None,
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
     launch: Launch = run_in_processes,
@@ -66,6 +69,7 @@ def train(
         settings: see `TrainingSettings`.
         start: checkpoint to start from, such as the teacher; by default training starts from
             scratch.
+        options: the detector's options; the ones that its `load_student` has are passed to it.
         read: see `WeightedLabels`.
         progress: called after every step with the step, the number of steps and the loss.
         launch: starts the processes if there are several; by default on this machine.
@@ -86,7 +90,7 @@ def train(
     settings = replace(settings, preset=choose_preset(detector, settings.preset))
     samples = WeightedLabels(labels, read=read)
     processes = _useful_processes(settings, samples)
-    student = _first_student(detector, settings, samples.categories, start)
+    student = _first_student(detector, settings, samples.categories, start, options or {})
     check_device(settings.device)
     mark = fingerprint(detector, labels, settings, start)
     writer = _Writer(labels, output, settings.steps, progress)
@@ -182,6 +186,7 @@ def _first_student(
     settings: TrainingSettings,
     categories: tuple[str, ...],
     start: Path | None,
+    options: Mapping[str, Any],
 ) -> Student:
     """Return the student before the first step, on the CPU."""
     if start is None:
@@ -189,7 +194,8 @@ def _first_student(
             torch.manual_seed(settings.seed)
             student = detector.new_student(settings.preset or "", categories)
     else:
-        student = detector.load_student(start)
+        accepted = inspect.signature(detector.load_student).parameters.keys() & options.keys()
+        student = detector.load_student(start, **{name: options[name] for name in accepted})
     expected = (*Student.__annotations__, *(name for name in vars(Student) if name[0] != "_"))
     missing = [name for name in expected if not hasattr(student, name)]
     if missing:
@@ -197,9 +203,10 @@ def _first_student(
             f"{type(student).__module__}:{type(student).__qualname__} has no {', '.join(missing)}; "
             "see curate.detectors.base.Student"
         )
-    if (student.preset, student.categories) != (settings.preset, categories):
+    preset = student.preset or settings.preset
+    if (preset, student.categories) != (settings.preset, categories):
         raise ConfigError(
-            f"{start}: has preset {student.preset} and categories {', '.join(student.categories)}; "
+            f"{start}: has preset {preset} and categories {', '.join(student.categories)}; "
             f"the training needs {settings.preset} and {', '.join(categories)}"
         )
     return student

@@ -60,6 +60,10 @@ def init(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Checkpoint, model file or results of an external detector."),
     ] = None,
+    detector_config: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Model file (YAML) of a checkpoint of OpenPCDet."),
+    ] = None,
     segmenter: Annotated[
         str,
         typer.Option(
@@ -115,7 +119,11 @@ def init(
             "follow_links": follow_links,
             "options": dict(map(_option, dataset_option or ())),
         },
-        "detector": {"name": detector, "path": detector_path and detector_path.resolve()},
+        "detector": {
+            "name": detector,
+            "path": detector_path and detector_path.resolve(),
+            "options": _model_file(detector, detector_path, detector_config),
+        },
         "segmenter": {
             "name": segmenter,
             "path": segmenter_path and segmenter_path.resolve(),
@@ -152,6 +160,19 @@ def init(
     if objects:
         tail = f"; not in dataset.categories: {listed(others)}" if others else ""
         print_line(f"objects in the label files: {listed(used)}{tail}")
+
+
+def _model_file(detector: str, path: Path | None, config: Path | None) -> dict[str, str]:
+    """Return the detector's option with its model file: the given one, or that beside the path."""
+    from curate.errors import ConfigError
+
+    if config is not None and not config.is_file():
+        raise ConfigError(f"--detector-config {config}: no such file")
+    if config is None and path is not None:
+        DETECTORS.check_name(detector)
+        beside = path.with_suffix(".yaml")
+        config = beside if beside.is_file() and DETECTORS.takes(detector, "config") else None
+    return {} if config is None else {"config": str(config.resolve())}
 
 
 def _option(text: str) -> tuple[str, Any]:

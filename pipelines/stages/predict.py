@@ -311,10 +311,10 @@ def option_files(workspace: Workspace) -> dict[str, str]:
 
 
 def _option_paths(options: object) -> Iterator[str]:
-    """Yield the values of all keys `path` and `frame_list` in nested options."""
+    """Yield the values of all keys `path`, `frame_list` and `config` in nested options."""
     if isinstance(options, Mapping):
         for key, value in options.items():
-            if key in {"path", "frame_list"} and isinstance(value, str):
+            if key in {"path", "frame_list", "config"} and isinstance(value, str):
                 yield value
             yield from _option_paths(value)
     elif isinstance(options, list | tuple):

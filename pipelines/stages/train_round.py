@@ -274,6 +274,7 @@ def train_with_progress(
             output,
             replace(settings, processes=processes),
             start=start,
+            options=config.detector.options,
             read=FrameReader(config, workspace.dataset),
             progress=show,
             launch=launch,

@@ -9,6 +9,7 @@ import pytest
 import torch
 from contracts.samples import assert_one_line, assert_same, sample_of
 from support.external_detector import command_of, write_script
+from support.openpcdet_files import write_files
 from support.tiny_onnx import tiny_detector
 from support.toys import write_toy_kitti
 
@@ -71,11 +72,17 @@ def write_command(folder: Path, frames: Sequence[Frame]) -> Path:
     return write_script(folder)
 
 
+def write_openpcdet(folder: Path, frames: Sequence[Frame]) -> Path:
+    """Write a checkpoint of a small Voxel R-CNN with its model file beside it."""
+    return write_files(folder)
+
+
 # Write the file from which the detector is created, for the test frames.
 SAMPLES: Mapping[str, Callable[[Path, Sequence[Frame]], Path]] = {
     "pillars": write_checkpoint,
     "recorded": write_record,
     "onnx": write_onnx,
+    "openpcdet": write_openpcdet,
     "command": write_command,
 }
 # Options that a detector needs besides, for its file.

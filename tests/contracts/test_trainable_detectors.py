@@ -293,6 +293,6 @@ def test_an_unknown_preset_is_rejected_before_any_work(toy_kitti: Path, tmp_path
 
 
 def test_a_registered_detector_without_training_is_not_trained() -> None:
-    assert trainable_names() == ["pillars"]
+    assert trainable_names() == ["pillars", "openpcdet"]
     assert set(trainable_names()) < set(DETECTORS.classes)
     assert np.all([trainable(name) is None for name in ("onnx", "recorded")])

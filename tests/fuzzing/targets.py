@@ -272,6 +272,30 @@ def _read_checkpoint(path: Path) -> None:
         network_of(checkpoint)
 
 
+def _openpcdet(path: Path) -> None:
+    from support.openpcdet_files import write_files
+
+    write_files(path.parent).rename(path)
+
+
+def _read_openpcdet(path: Path) -> None:
+    from curate.detectors.openpcdet.checkpoint import load_network
+
+    load_network(path, path.parent / "model.yaml")
+
+
+def _model_file(path: Path) -> None:
+    from support.openpcdet_files import document
+
+    path.write_text(json.dumps(document()))
+
+
+def _read_model_file(path: Path) -> None:
+    from curate.detectors.openpcdet.schema import load_model_file
+
+    load_model_file(path)
+
+
 def _onnx(path: Path) -> None:
     from support.tiny_onnx import tiny_detector
 
@@ -362,6 +386,8 @@ TARGETS: dict[str, Target] = {
     "pickle 5": Target("a.pkl", _pickled(5), _read_list),
     "json": Target("a.json", _json, _read_list),
     "checkpoint": Target("a.safetensors", _safetensors, _read_checkpoint),
+    "openpcdet checkpoint": Target("a.pth", _openpcdet, _read_openpcdet),
+    "openpcdet model file": Target("a.yaml", _model_file, _read_model_file),
     "onnx detector": Target("a.onnx", _onnx, _read_onnx),
     "onnx segmenter": Target("a.onnx", _segmenter, _read_segmenter),
     "label file": Target("labels.sqlite", _label_file, _read_label_file),

@@ -22,6 +22,7 @@ COSTLY = {
     "onnx segmenter": 15,
     "onnx instances": 15,
     "checkpoint": 15,
+    "openpcdet checkpoint": 15,
     "configuration": 20,
 }
 
