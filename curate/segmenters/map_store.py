@@ -17,7 +17,6 @@ import json
 import os
 import shutil
 import time
-import uuid
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
@@ -126,23 +125,15 @@ class MapStore:
             return f"{existing}: no space left for semantic maps; free some, or set segmenter.cache"
         return ""
 
-    def identity(self) -> str:
-        """Return the random name of the segmenter's folder, given by `prepare`; "" if it is gone.
-
-        It tells whether maps that were stored once are still there.
-        """
-        try:
-            found = json.loads((self.folder / _DESCRIPTION).read_text()).get("folder")
-        except (OSError, ValueError, AttributeError):
-            return ""
-        return str(found or "")
+    def exists(self) -> bool:
+        """Return whether the segmenter's folder is there."""
+        return (self.folder / _DESCRIPTION).exists()
 
     def prepare(self) -> None:
         """Make the segmenter's folder, with a file for people that says what made its maps."""
-        if self.identity() or self.refusal():
+        if self.exists() or self.refusal():
             return
-        content = {"folder": uuid.uuid4().hex, **self.made_by}
-        text = json.dumps(content, sort_keys=True, default=str, indent=2)
+        text = json.dumps(self.made_by, sort_keys=True, default=str, indent=2)
         with suppress(OSError):  # then no map can be stored either, and a warning says so
             replace_file(self.folder / _DESCRIPTION, f"{text}\n".encode())
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from db import bulk
 from pipelines.assembly import (
     check_segmenter,
     check_segmenter_names,
@@ -53,14 +54,18 @@ class Segment(ReadsAhead):
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> dict[str, Any]:
-    """Return what the maps depend on besides the images, and the folder that contains them."""
-    folder = open_map_store(workspace.config).identity()
-    return {**made_by(workspace.config), "folder": folder}
+    """Return what the maps depend on besides the images, and whether their folder is there."""
+    return {**made_by(workspace.config), "stored": open_map_store(workspace.config).exists()}
 
 
 def prepare(workspace: Workspace) -> None:
-    """Make the folder of the maps; if it was deleted, all maps are waiting again."""
-    open_map_store(workspace.config).prepare()
+    """Make the folder of the maps. If it was deleted, no map counts as made."""
+    store = open_map_store(workspace.config)
+    if not store.exists():
+        with workspace.database.writing() as connection:
+            task = bulk.table("task")
+            connection.execute(task.delete().where(task.c.stage == "segment"))
+        store.prepare()
 
 
 def function(workspace: Workspace, _context: RoundContext) -> Segment:
