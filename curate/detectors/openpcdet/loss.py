@@ -23,6 +23,7 @@ from curate.detectors.openpcdet.network import FirstStage
 from curate.detectors.openpcdet.roi_head import refine
 from curate.detectors.openpcdet.schema import AnchorHead, VoxelRCNNHead
 from curate.detectors.openpcdet.targets import AnchorTargets, RoITargets
+from curate.detectors.whole_batch import whole_batch_sum
 
 # Focal loss: share of the positives, and exponent.
 _ALPHA = 0.25
@@ -40,7 +41,7 @@ def anchor_loss(stage: FirstStage, targets: AnchorTargets, config: AnchorHead) -
         config: factors of the terms, and the bins of the direction.
     """
     factors = config.loss_config.loss_weights
-    frames = len(targets.counts)
+    frames = whole_batch_sum(targets.counts.new_tensor(len(targets.counts)))
     # A frame without positives is divided by 1.
     shares = 1 / (targets.counts.clamp(min=1) * frames)
     at = (targets.rows, targets.anchors)
@@ -90,8 +91,8 @@ def roi_loss(
     """
     factors = config.loss_config.loss_weights
     entropy = functional.binary_cross_entropy_with_logits(logits, targets.scores, reduction="none")
-    counted = (targets.weights > 0).sum().clamp(min=1)
-    refined = (targets.box_weights > 0).sum().clamp(min=1)
+    own_counts = torch.stack([(targets.weights > 0).sum(), (targets.box_weights > 0).sum()])
+    counted, refined = whole_batch_sum(own_counts).clamp(min=1)
     own = codes[targets.refined]
     boxes = _smooth_l1(own - targets.codes, factors.code_weights).sum(dim=1)
     terms = {

@@ -25,6 +25,7 @@ from curate.detectors.openpcdet.normalisation import RowNorm
 from curate.detectors.openpcdet.pooling import NearMaximum, near_voxels
 from curate.detectors.openpcdet.schema import Data, PoolLayer, VoxelRCNNHead
 from curate.detectors.openpcdet.sparse import SparseTensor
+from curate.detectors.whole_batch import whole_batch_sum
 
 
 class RoIHead(nn.Module):
@@ -140,20 +141,32 @@ class PooledLevel(nn.Module):
         mlp = self.mlps_pos[0]
         assert isinstance(mlp, _PointwiseNorm)  # noqa: S101 - the list is made of them
         weight, norm = mlp.parts()
-        if not (self.training and len(near) and len(centres)):  # no pairs, no statistics
+        if not self.training:
             scale, shift = norm.affine_map()
             return scale[:, None] * weight, shift
-        away = centres[near.clamp(min=0)] - points[:, None]
-        # Sums over a million pairs are wrong by 1e-4 in float32.
-        away = torch.where(near[..., None] < 0, 0.0, away).flatten(0, 1).double()
-        mean = away.mean(dim=0)
-        away = away - mean
-        covariance = (away.t() @ away / len(away)).to(weight)
-        mean = mean.to(weight)
+        mean, covariance, count = _statistics(centres, near, points)
+        mean, covariance = mean.to(weight), covariance.to(weight)
         variance = ((weight @ covariance) * weight).sum(dim=1)
-        norm.update(weight @ mean, variance, len(away))
+        norm.update(weight @ mean, variance, count)
         matrix = (norm.weight * torch.rsqrt(variance + norm.eps))[:, None] * weight
         return matrix, norm.bias - matrix @ mean
+
+
+def _statistics(centres: Tensor, near: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return mean, covariance and number of the differences c_j - g of the whole batch.
+
+    A point without a voxel near it counts with differences of 0. In double precision: sums over a
+    million pairs are wrong by 1e-4 in float32.
+    """
+    away = points.new_zeros((*near.shape, 3))
+    if len(centres):
+        away = centres[near.clamp(min=0)] - points[:, None]
+    away = torch.where(near[..., None] < 0, 0.0, away).flatten(0, 1).double()
+    own = torch.cat([away.new_full((1,), len(away)), away.sum(dim=0), (away.t() @ away).flatten()])
+    joined = whole_batch_sum(own)
+    count = joined[0]
+    mean, squares = joined[1:4] / count.clamp(min=1), joined[4:].view(3, 3) / count.clamp(min=1)
+    return mean, squares - mean[:, None] * mean, count
 
 
 class _Pointwise(nn.Module):
