@@ -95,7 +95,7 @@ def package_name(text: str) -> str:
 
 
 def free_megabytes() -> float:
-    """Return the free space of the disk, whose change shows how much was written.
+    """Return the free space of the disk; its change shows how much was written.
 
     This takes no time; `installed_megabytes` looks at every file.
     """

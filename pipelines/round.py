@@ -45,6 +45,7 @@ _SEGMENT = (
         check=segment.check,
         refusal=segment.refusal,
         prepare=segment.prepare,
+        exists=segment.exists,
     ),
 )
 _DETECT = (

@@ -1,4 +1,4 @@
-"""Sums over the whole batch, for a training whose batch is split over several processes.
+"""Sums over the whole batch, for a training that splits its batch over several processes.
 
 Each process computes the loss of its own frames. The sum of these losses must be the loss of the
 whole batch, so a loss that divides by a count of the batch divides by `whole_batch_sum(count)`:

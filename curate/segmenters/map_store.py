@@ -6,9 +6,9 @@ The names of folder and file are hashes of everything that the map depends on:
     maps/7c1f0a22b3d94e05/3e/3e97....gz       the map of the image file with this SHA-256
 
 So a map of another model or of another image is never read, several processes and workspaces can
-use one folder, and a map has the same content whoever writes it. A file is gzip, whose checksum
-reveals damage: a line of JSON (the two hashes, height, width, the class ids of each category), then
-a byte per pixel, row by row.
+use one folder, and every process writes the same content. A file is in gzip's format, which has a
+checksum that reveals damage. It contains a line of JSON (the two hashes, height, width, the class
+ids of each category), then a byte per pixel, row by row.
 """
 
 import gzip

@@ -24,7 +24,6 @@ from itertools import pairwise
 from math import ceil
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from curate.datasets.formats.images import MAX_PIXELS
@@ -150,6 +149,8 @@ class OnnxSegmenter(Segmenter):
 
     def _run(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the (h, w) uint8 class ids of (h, w, 3) images of one size."""
+        import cv2
+
         height, width = images[0].shape[:2]
         shape = self._model.input
         target = (shape.width or width, shape.height or height)

@@ -137,7 +137,7 @@ def run_steps(job: TrainingJob, place: Place, report: Report) -> None:
     Args:
         job: what to train.
         place: the place of this process.
-        report: called as the training goes on; the last message is `Trained`. All processes report
+        report: called during the training; the last message is `Trained`. All processes report
             the same.
 
     Raises:

@@ -2,7 +2,7 @@
 
 The calling process starts the others and waits. It is the only one that writes files: the first
 process sends it the progress, the snapshots and the final weights. The processes find each other
-through a file, and talk over sockets of the loopback interface whose ports the system chooses.
+through a file, and exchange data over the loopback interface; the system chooses the ports.
 
     caller ── job ──> process 0 ── progress, snapshots, weights ──> caller
            ── job ──> process 1 ── errors ────────────────────────> caller

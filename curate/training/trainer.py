@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 # Arguments: number of the step, number of steps, loss of the step.
 Progress = Callable[[int, int, float], None]
 
-# A training whose processes are killed this often without a new snapshot in between ends.
+# The training ends after this many killed processes without a new snapshot in between.
 _DEATHS = 4
 
 

@@ -196,12 +196,10 @@ class Plan:
     def fingerprint(self, stage: FramesStage) -> str:
         """Return the current fingerprint of a stage of frames.
 
-        That of a cache is computed each time: it changes when the stage makes its folder.
+        A cache without its folder has none, so that all frames are waiting.
         """
-        if isinstance(stage, CacheStage):
-            return _fingerprint(
-                stage.name, stage.settings(self.workspace, self.context), stage.reads, self._sources
-            )
+        if isinstance(stage, CacheStage) and not stage.exists(self.workspace):
+            return ""
         return self._of_frames[stage.name]
 
     def waiting_frames(

@@ -183,10 +183,12 @@ class CacheStage(_FramesStage):
         function: function that returns what the stage does with a frame; it returns no rows.
         refusal: function that returns a function, which returns why nothing further can be stored;
             "" if it can. The stage then ends early.
+        exists: function that returns whether the folder of what it stored is there.
     """
 
     function: Callable[[Workspace, RoundContext], FrameFunction]
     refusal: Callable[[Workspace], Callable[[], str]]
+    exists: Callable[[Workspace], bool]
 
     @property
     def results(self) -> tuple[str, ...]:

@@ -4,10 +4,10 @@ import hashlib
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from curate.datasets.copies import copy_kind
 from curate.datasets.manifest import NAME, Manifest, sample_hashes, view_folder
-from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError, DataError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
@@ -20,6 +20,9 @@ from pipelines.assembly import Place, copies_folder, open_detector
 from pipelines.engine.stage import RoundContext
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, sha256
+
+if TYPE_CHECKING:
+    from curate.detectors.recorded import RecordedDetector
 
 _log = logging.getLogger(__name__)
 
@@ -78,6 +81,8 @@ def check_copies(workspace: Workspace, context: RoundContext, split: str) -> Non
         DataError: if the copies are not those of this round, results are missing, or they do not
             belong to the copies.
     """
+    from curate.detectors.recorded import RecordedDetector
+
     folder = copies_folder(workspace.config, context.number)
     frames = list(workspace.frames(split))
     if folder is None or not frames:
@@ -109,7 +114,7 @@ def check_copies(workspace: Workspace, context: RoundContext, split: str) -> Non
 
 
 def _problem(
-    detector: RecordedDetector, manifest: Manifest, view: int, frames: Sequence[str]
+    detector: "RecordedDetector", manifest: Manifest, view: int, frames: Sequence[str]
 ) -> str:
     """Return in which way the results of a view do not belong to its copies; "" if they do."""
     chosen = frames[:: max(1, len(frames) // _COMPARED)]

@@ -9,6 +9,7 @@ import numpy as np
 from curate.consistency import Consistency, consistency, mean_over_views
 from curate.detections import Detections
 from curate.detectors.base import CopiesDetector, RecordedViews
+from curate.detectors.option_names import name_results_options
 from curate.errors import CurateError, ModelError, WorkspaceError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
@@ -122,8 +123,7 @@ class Repredict(Predict):
 
         problem, remark = examine_view(view, read)
         if problem:
-            setting = "detector.options.rotation_y"
-            problem = problem.replace(setting, "detector.options.results.rotation_y")
+            problem = name_results_options(problem)
             raise ModelError(f"detector.options.command, view {view + 1}: {problem}")
         if remark:
             warn_once(f"detector.options.command, view {view + 1}: {remark}")

@@ -54,8 +54,13 @@ class Segment(ReadsAhead):
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> dict[str, Any]:
-    """Return what the maps depend on besides the images, and whether their folder is there."""
-    return {**made_by(workspace.config), "stored": open_map_store(workspace.config).exists()}
+    """Return what the maps depend on besides the images."""
+    return made_by(workspace.config)
+
+
+def exists(workspace: Workspace) -> bool:
+    """Return whether the folder of the maps is there."""
+    return open_map_store(workspace.config).exists()
 
 
 def prepare(workspace: Workspace) -> None:

@@ -51,6 +51,13 @@ PolicyName = Annotated[str, KnownName(registry.POLICIES)]
 ExporterName = Annotated[str, KnownName(registry.EXPORTERS)]
 ExecutorName = Annotated[str, KnownName(registry.EXECUTORS)]
 ProviderName = Annotated[str, KnownProvider()]
+ProviderTable = Annotated[
+    dict[ProviderName, Options] | None,
+    Field(
+        description="Options of the providers by their names.",
+        examples=[{"cuda": {"device_id": 1}}],
+    ),
+]
 
 DEFAULT_PRIORS = ("points", "semantic")
 
@@ -217,11 +224,7 @@ class DetectorSection(Section):
         description="Execution providers of ONNX Runtime for a detector in ONNX, the preferred one "
         "first; each must work. 'auto' takes one that fits the device; see docs/detectors.md.",
     )
-    provider_options: dict[ProviderName, Options] | None = Field(
-        default=None,
-        description="Options of the providers by their names.",
-        examples=[{"cuda": {"device_id": 1}}],
-    )
+    provider_options: ProviderTable = None
     precision: Precision = Field(
         default="float32",
         description="Type of numbers in which a detector in torch predicts. The shorter ones save "
@@ -295,11 +298,7 @@ class SegmenterSection(Section):
         "one first; each must work. 'auto' takes the best one that is installed and works; see "
         "docs/segmenters.md.",
     )
-    provider_options: dict[ProviderName, Options] | None = Field(
-        default=None,
-        description="Options of the providers by their names.",
-        examples=[{"cuda": {"device_id": 1}}],
-    )
+    provider_options: ProviderTable = None
     rename: Rename = Field(
         default=None,
         description="Category for names in the segmenter's table of classes; other names stay as "

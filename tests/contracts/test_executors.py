@@ -12,7 +12,14 @@ from support.toys import toy_document, write_toy_kitti
 
 from curate.errors import CurateError, ModelError
 from pipelines.engine.executors.auto import AutoExecutor
-from pipelines.engine.executors.base import Executor, FrameJob, batches_for
+from pipelines.engine.executors.base import (
+    Executor,
+    FrameJob,
+    Job,
+    JobQueue,
+    Outcome,
+    batches_for,
+)
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.registry import EXECUTORS
 from pipelines.workspace.config import make_config
@@ -123,6 +130,23 @@ def test_only_the_frame_that_kills_its_workers_fails(crew: Executor, tmp_path: P
     assert failed[5].rows == ()
     assert failed[5].error.startswith("frame 000005: its worker died 2 times, ")
     assert_one_line(Exception(failed[5].error))
+
+
+def test_a_suspect_frame_crashes_its_worker_alone(
+    crew: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No result of another frame can be lost with it, so that it alone is to blame."""
+    in_flight: list[list[int]] = []
+    record = JobQueue.record_crash
+
+    def watched(queue: JobQueue, jobs: list[Job], reason: str, **how: bool) -> Iterator[Outcome]:
+        in_flight.append([job.frame_id for job in jobs])
+        yield from record(queue, jobs, reason, **how)
+
+    monkeypatch.setattr(JobQueue, "record_crash", watched)
+    list(crew.map(Deadly(folder=tmp_path, always=(5, 6, 20)), iter(JOBS)))
+    last = {jobs[0]: jobs for jobs in in_flight}
+    assert {key: last[key] for key in (5, 6, 20)} == {5: [5], 6: [6], 20: [20]}
 
 
 def batch_outcomes(executor: Executor, function: SquareBatches) -> dict[int, str | list]:

@@ -16,7 +16,7 @@ from pathlib import Path
 KEPT_FAILURES = 3
 KEPT_LOGS = 200
 _LOCK = "lock"
-# A folder without a lock is a new one whose process has not locked it yet, unless it is old.
+# A folder without a lock that is younger than this is new: its process has not locked it yet.
 _LOCKED_AFTER_S = 60.0
 
 

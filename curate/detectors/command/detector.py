@@ -10,10 +10,9 @@ data set's own layout. The command writes results in any format of `curate.detec
 """
 
 import inspect
-import re
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +22,7 @@ from curate.datasets.base import Dataset
 from curate.datasets.copies import copy_writer
 from curate.detections import Detections
 from curate.detectors.command.batch_folders import BatchFolders
+from curate.detectors.option_names import name_results_options, results_options_named
 from curate.detectors.recorded import RecordedDetector
 from curate.detectors.recorded.formats import check_kind
 from curate.errors import ConfigError, CurateError, DataError, ModelError, one_line
@@ -257,7 +257,7 @@ class CommandDetector:
             if isinstance(value, str):
                 options[key] = fill(value, values)
         path = _result_path(Path(values["results"]), options.pop("path", None), copies)
-        with _own_options():
+        with results_options_named():
             return RecordedDetector(
                 path,
                 self._minimum_score,
@@ -281,23 +281,7 @@ def _moved(found: Detections | CurateError, folder: Path, kept: Path) -> Detecti
     """Return an error that refers to the folder that was kept."""
     if isinstance(found, Detections):
         return found
-    return type(found)(_renamed(str(found).replace(str(folder), str(kept))))
-
-
-def _renamed(message: str) -> str:
-    """Return a message of the reader of results with its options named as they are set here."""
-    return re.sub(
-        r"detector\.options\.(?!results|command|files)", "detector.options.results.", message
-    )
-
-
-@contextmanager
-def _own_options() -> Iterator[None]:
-    """Name the options of the reader of results in its errors as they are set here."""
-    try:
-        yield
-    except CurateError as error:
-        raise type(error)(_renamed(str(error))) from error
+    return type(found)(name_results_options(str(found).replace(str(folder), str(kept))))
 
 
 def _check_command(command: UserCommand) -> None:
@@ -331,7 +315,7 @@ def _check_results(results: Mapping[str, Any]) -> None:
             raise ConfigError(
                 f"detector.options.results has no '{key}'{hint}; it has {', '.join(known)}"
             )
-    with _own_options():
+    with results_options_named():
         check_kind(results.get("kind", "auto"))
     pattern = results.get("path", ".")
     if not isinstance(pattern, str) or Path(pattern).is_absolute():

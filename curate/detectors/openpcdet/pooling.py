@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from curate.detectors.openpcdet.sparse import Sites
 
-# Grid points whose surroundings are searched at once on a GPU, which bounds its memory.
+# Grid points that are searched at once on a GPU; more would need more of its memory.
 _CHUNK = 4096
 
 

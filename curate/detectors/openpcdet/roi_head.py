@@ -170,7 +170,7 @@ def _statistics(centres: Tensor, near: Tensor, points: Tensor) -> tuple[Tensor, 
 
 
 class _Pointwise(nn.Module):
-    """A linear layer whose weight has the shape of a 1 x 1 convolution."""
+    """A linear layer with a weight in the shape of a 1 x 1 convolution."""
 
     def __init__(self, channels_in: int, channels_out: int, axes: int) -> None:
         super().__init__()

@@ -4,7 +4,7 @@ import logging
 import pickle
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -162,7 +162,7 @@ class BatchFunction(Protocol):
 
 @runtime_checkable
 class TrialFunction(BatchFunction, Protocol):
-    """A function whose every call may fail for the same reason, such as a command of the user.
+    """A function with calls that may all fail for the same reason, such as a command of the user.
 
     The run ends if its first call, with a few frames, or several later ones in a row fail.
     """
@@ -308,6 +308,16 @@ class JobQueue:
     def return_jobs(self, jobs: Iterable[Job]) -> None:
         """Requeue jobs that no worker has started."""
         self._again.extend(jobs)
+
+    def allows_another(self, in_flight: Collection[Job]) -> bool:
+        """Return whether a worker with these jobs may get another one.
+
+        A job that seemed to crash its worker gets none behind it: if the worker crashes again, no
+        result of a former job can be lost with it, and that job alone is to blame.
+        """
+        return len(in_flight) < JOBS_PER_WORKER and not any(
+            self._crashes[job.title] for job in in_flight
+        )
 
     def record_opened(self) -> None:
         """Record that a worker has loaded its models."""

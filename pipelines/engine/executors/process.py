@@ -18,7 +18,6 @@ from typing import Any
 
 from curate.errors import CurateError
 from pipelines.engine.executors.base import (
-    JOBS_PER_WORKER,
     FunctionHolder,
     Job,
     JobFunction,
@@ -79,13 +78,14 @@ class ProcessExecutor:
     def _dispatch(self, packed: bytes, queue: JobQueue, workers: int) -> None:
         while (job := queue.take()) is not None:
             crew = self._workers[:workers]
-            idle = min(crew, key=lambda worker: len(worker.in_flight), default=None)
-            if len(crew) < workers and (idle is None or idle.in_flight):
-                self._workers.append(idle := _Worker())
-            if idle is None or len(idle.in_flight) == JOBS_PER_WORKER:
+            free = [worker for worker in crew if queue.allows_another(worker.in_flight)]
+            if len(crew) < workers and all(worker.in_flight for worker in free):
+                self._workers.append(worker := _Worker())
+                free.append(worker)
+            if not free:
                 queue.return_jobs([job])
                 return
-            idle.send(packed, job)
+            min(free, key=lambda worker: len(worker.in_flight)).send(packed, job)
 
     def _collect(self, worker: "_Worker", queue: JobQueue) -> Iterator[Outcome]:
         """Yield the next outcome of a worker; if it has crashed, those of its failed jobs."""

@@ -17,7 +17,6 @@ from typing import Any
 
 from curate.errors import ConfigError, CurateError, DataError, one_line
 from pipelines.engine.executors.base import (
-    JOBS_PER_WORKER,
     FunctionHolder,
     Job,
     JobFunction,
@@ -116,7 +115,7 @@ class RayExecutor:
             crew = self._actors[:workers]
             for actor in crew:
                 actor.open(packed)
-            free = [actor for actor in crew if actor.opened and len(actor.jobs) < JOBS_PER_WORKER]
+            free = [actor for actor in crew if actor.opened and queue.allows_another(actor.jobs)]
             if not free:
                 queue.return_jobs([job])
                 return True
