@@ -95,7 +95,11 @@ def _second_stage(
 
 def _highest(scores: Tensor, most: int) -> Tensor:
     """Return the indices of the highest scores, in descending order; equal ones by index."""
-    return torch.sort(scores, descending=True, stable=True)[1][:most]
+    if len(scores) > most:
+        least = torch.kthvalue(scores, len(scores) - most + 1)[0]
+        enough = torch.nonzero(scores >= least)[:, 0]
+        return enough[_highest(scores[enough], len(enough))][:most]
+    return torch.sort(scores, descending=True, stable=True)[1]
 
 
 def _suppressed(boxes: np.ndarray, scores: np.ndarray, config: NMS) -> np.ndarray:

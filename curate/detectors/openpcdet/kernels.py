@@ -134,3 +134,51 @@ def near_voxels(
         for k in range(max(count, 1), most):
             found[i, k] = found[i, 0]
     return found
+
+
+@njit(cache=True, nogil=True)
+def match_rectangles(
+    rectangles: np.ndarray, objects: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the best object of each rectangle, and whether it is the best of an object.
+
+    All arithmetic is in float32, as in OpenPCDet: overlaps are often equal, and all equal ones are
+    the best of an object.
+
+    Args:
+        rectangles: (a, 4) float32 lowest x, y and highest x, y.
+        objects: (m, 4) float32, the same; m > 0.
+
+    Returns:
+        (a,) int64 first object with the largest IoU, (a,) float32 its IoU, and (a,) whether no
+        rectangle has a larger IoU with some object.
+    """
+    best = np.zeros(len(rectangles), np.int64)
+    most = np.zeros(len(rectangles), np.float32)
+    highest = np.zeros(len(objects), np.float32)
+    for i in range(len(rectangles)):
+        for j in range(len(objects)):
+            overlap = _iou(rectangles[i], objects[j])
+            if overlap > most[i]:
+                best[i], most[i] = j, overlap
+            highest[j] = max(highest[j], overlap)
+    is_highest = np.zeros(len(rectangles), np.bool_)
+    for i in range(len(rectangles)):
+        if most[i] == 0:
+            continue
+        for j in range(len(objects)):
+            if highest[j] > 0 and _iou(rectangles[i], objects[j]) == highest[j]:
+                is_highest[i] = True
+    return best, most, is_highest
+
+
+@njit(cache=True, nogil=True)
+def _iou(a: np.ndarray, b: np.ndarray) -> np.float32:
+    """Return the IoU of two rectangles in float32."""
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    if width <= 0 or height <= 0:
+        return np.float32(0)
+    common = width * height
+    union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common
+    return common / max(union, np.float32(1e-6))

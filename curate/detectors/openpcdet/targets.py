@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from curate.detectors.openpcdet.anchors import encode, turned
+from curate.detectors.openpcdet.kernels import match_rectangles
 from curate.detectors.openpcdet.schema import ModelFile, ProposalSampling
 from curate.geometry.overlap import iou_3d
 from curate.shapes import Float, Float32, Int
@@ -93,11 +94,9 @@ def match_anchors(
         if len(candidates) == 0:
             continue
         own = np.flatnonzero(classes == number)
-        overlap = nearest_bev_iou(anchors[own], objects.boxes[candidates])
-        best = overlap.argmax(axis=1)
-        most = overlap[np.arange(len(own)), best]
-        highest = overlap.max(axis=0)
-        is_highest = ((overlap == highest) & (highest > 0)).any(axis=1)
+        best, most, is_highest = match_rectangles(
+            upright_rectangles(anchors[own]), upright_rectangles(objects.boxes[candidates])
+        )
         positive = (most >= np.float32(each.matched_threshold)) | is_highest
         labels[own] = np.where(most < np.float32(each.unmatched_threshold), 0, -1)
         labels[own[positive]] = number + 1
@@ -143,26 +142,13 @@ def anchor_targets(
     return AnchorTargets(*(each.to(device) for each in found_tensors))
 
 
-def nearest_bev_iou(
-    boxes_a: Float32[np.ndarray, "n 7"], boxes_b: Float32[np.ndarray, "m 7"]
-) -> Float32[np.ndarray, "n m"]:
-    """Return the BEV IoU of every pair, of boxes turned to the nearest multiple of 90 degrees."""
-    low_a, high_a = _upright(boxes_a)
-    low_b, high_b = _upright(boxes_b)
-    sides = np.minimum(high_a[:, None], high_b) - np.maximum(low_a[:, None], low_b)
-    sides = np.maximum(sides, np.float32(0))
-    common = sides[..., 0] * sides[..., 1]
-    areas = np.prod(high_a - low_a, axis=1)[:, None] + np.prod(high_b - low_b, axis=1)
-    return np.asarray(common / np.maximum(areas - common, np.float32(1e-6)))
-
-
-def _upright(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest x, y of boxes turned to the nearest multiple of 90 degrees."""
+def upright_rectangles(boxes: Float32[np.ndarray, "n 7"]) -> Float32[np.ndarray, "n 4"]:
+    """Return lowest and highest x, y of boxes turned to the nearest multiple of 90 degrees."""
     half_turn = np.float32(np.pi)
     yaw = np.abs(boxes[:, 6] - np.floor(boxes[:, 6] / half_turn + np.float32(0.5)) * half_turn)
     along_x = (yaw < np.float32(np.pi / 4))[:, None]
     sides = np.where(along_x, boxes[:, 3:5], boxes[:, [4, 3]])
-    return boxes[:, :2] - sides / 2, boxes[:, :2] + sides / 2
+    return np.concatenate([boxes[:, :2] - sides / 2, boxes[:, :2] + sides / 2], axis=1)
 
 
 @dataclass(frozen=True)

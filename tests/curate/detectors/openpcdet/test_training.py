@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from support.openpcdet_files import random_network, sweep, write_files
 
 from curate.detections import CATEGORIES
@@ -15,6 +15,7 @@ from curate.detectors.base import Sample
 from curate.detectors.openpcdet.anchors import anchor_classes, decode, encode
 from curate.detectors.openpcdet.checkpoint import load_network
 from curate.detectors.openpcdet.inference import detect
+from curate.detectors.openpcdet.kernels import match_rectangles
 from curate.detectors.openpcdet.loss import anchor_loss, corner_loss, roi_loss
 from curate.detectors.openpcdet.network import Batch
 from curate.detectors.openpcdet.presets import PRESETS, preset_file
@@ -24,9 +25,9 @@ from curate.detectors.openpcdet.targets import (
     Objects,
     anchor_targets,
     match_anchors,
-    nearest_bev_iou,
     roi_targets,
     sample_rois,
+    upright_rectangles,
 )
 from curate.detectors.openpcdet.training import AnchorStudent
 from curate.detectors.openpcdet.voxels import make_voxels
@@ -416,7 +417,33 @@ def test_the_nearest_bev_iou_is_the_bev_iou_of_aligned_boxes() -> None:
     aligned[:, 6] = quarter
     tilted[:, 6] = quarter + rng.uniform(-0.7, 0.7, 30)
     expected = bev_iou(aligned.astype(np.float64), aligned.astype(np.float64))
-    assert_allclose(nearest_bev_iou(tilted, aligned), expected, atol=1e-5)
+    upright = upright_rectangles(aligned)
+    for k in range(30):  # the IoU with one object at a time
+        _, found, _ = match_rectangles(upright_rectangles(tilted), upright[k : k + 1])
+        assert_allclose(found, expected[:, k], atol=1e-5)
+
+
+def test_rectangles_match_the_object_that_they_overlap_most() -> None:
+    """All rectangles with the largest IoU of an object are its best; none if nothing overlaps."""
+    rng = np.random.default_rng(1)
+    low = rng.integers(0, 12, (60, 2))
+    rectangles = np.concatenate([low, low + rng.integers(1, 5, (60, 2))], axis=1)
+    objects = np.concatenate([rectangles[:6] + 1, [[90, 90, 91, 91]]])
+    boxes = [
+        np.column_stack([(each[:, :2] + each[:, 2:]) / 2, np.zeros(len(each)),
+                         each[:, 2:] - each[:, :2], np.ones(len(each)), np.zeros(len(each))])
+        for each in (rectangles, objects)
+    ]  # fmt: skip
+    overlap = bev_iou(*boxes)
+    best, most, is_highest = match_rectangles(
+        rectangles.astype(np.float32), objects.astype(np.float32)
+    )
+    assert_allclose(most, overlap.max(axis=1), atol=1e-6)
+    assert_array_equal(best, overlap.round(6).argmax(axis=1))
+    highest = overlap.max(axis=0)
+    expected = (np.isclose(overlap, highest) & (highest > 0)).any(axis=1)
+    assert_array_equal(is_highest, expected)
+    assert expected.sum() > 6
 
 
 def test_the_corner_loss_is_0_for_the_same_box_and_for_the_opposite_heading() -> None:
