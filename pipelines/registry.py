@@ -289,6 +289,17 @@ def trainable_names() -> list[str]:
     return [name for name in DETECTORS.classes if trainable(name)]
 
 
+def detector_and_preset(name: str) -> tuple[str, str | None]:
+    """Return a detector's name and its preset; the name of a preset selects its detector."""
+    if name in DETECTORS.classes or ":" in name:
+        return name, None
+    for owner in trainable_names():
+        found = trainable(owner)
+        if found is not None and name in found.presets:
+            return owner, name
+    return name, None
+
+
 def _keywords(
     factory: Callable[..., Any],
     offered: Mapping[str, Callable[[], Any]],

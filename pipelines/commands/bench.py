@@ -69,6 +69,13 @@ def bench(
         Optional[int],  # noqa: UP045
         typer.Option(min=1, help="Number of rounds of every method. Default: 2."),
     ] = None,
+    detector: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Detector to train, or one of its presets, such as voxel-rcnn-small "
+            "(docs/detectors.md). Default: pillars."
+        ),
+    ] = None,
     override: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option("--set", help="Any setting of curate.toml, as section.key=value; repeatable."),
@@ -109,6 +116,7 @@ def bench(
     kind = check_format(image_format or "png")
     if overlaps not in {"kitti", "loose", "all"}:
         raise ConfigError(f"--overlaps {overlaps}: use kitti, loose or all")
+    overrides = [*_detector_settings(detector), *map(_absolute, override or ())]
     requested = {
         "data": data,
         "frames": frames,
@@ -117,7 +125,7 @@ def bench(
         "steps": steps,
         "teacher_steps": teacher_steps,
         "rounds": rounds,
-        "overrides": tuple(map(_absolute, override)) if override else None,
+        "overrides": tuple(overrides) or None,
     }
     grid = {"methods": methods, "ratios": ratios, "seeds": seeds}
     chosen = _open(directory) if report else _choose(directory, requested, grid)
@@ -181,6 +189,16 @@ def _choose(directory: Path, requested: dict[str, Any], grid: dict[str, str | No
     for method in axes.methods:
         chosen.config(axes.seeds[0], method)
     return chosen
+
+
+def _detector_settings(detector: str | None) -> list[str]:
+    """Return the settings of a detector or preset."""
+    from pipelines.registry import detector_and_preset
+
+    if detector is None:
+        return []
+    name, preset = detector_and_preset(detector)
+    return [f"detector.name={name}", *([] if preset is None else [f"train.preset={preset}"])]
 
 
 def _absolute(override: str) -> str:

@@ -7,7 +7,7 @@ import typer
 
 from curate.segmenters.classes import CLASS_MAPS
 from pipelines.commands.options import JsonOption, complete, one_of, registered
-from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS
+from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS, detector_and_preset
 from pipelines.reports.terminal import print_json, print_line
 from pipelines.workspace.splits import SPLITS
 
@@ -52,7 +52,8 @@ def init(
     detector: Annotated[
         str,
         typer.Option(
-            help=f"Detector: {registered(DETECTORS)}.",
+            help=f"Detector: {registered(DETECTORS)}; or a preset to train, such as "
+            "voxel-rcnn-small (docs/detectors.md).",
             autocompletion=complete(DETECTORS.classes),
         ),
     ] = "pillars",
@@ -110,6 +111,7 @@ def init(
 
     if not root.is_dir():
         raise ConfigError(f"--root {root}: no such folder")
+    detector, preset = detector_and_preset(detector)
     run = {"seed": seed, "priors": ("points",) if segmenter == "none" else ("points", "semantic")}
     document: dict[str, Any] = {
         "dataset": {
@@ -129,6 +131,7 @@ def init(
             "path": segmenter_path and segmenter_path.resolve(),
             "classes": segmenter_classes,
         },
+        "train": {} if preset is None else {"preset": preset},
         "run": run,
     }
     for setting in settings or ():

@@ -6,7 +6,7 @@ from zlib import crc32
 import pytest
 
 from curate.errors import ConfigError
-from pipelines.registry import DETECTORS, PRIORS
+from pipelines.registry import DETECTORS, PRIORS, detector_and_preset
 
 
 @pytest.mark.parametrize(
@@ -93,3 +93,17 @@ def test_a_class_that_accepts_any_option_gets_all_options(
         "open_detectors_of_a_user:Anything", None, offered={}, options={"anything": 1}
     )
     assert made.options == {"anything": 1}
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("pillars", ("pillars", None)),
+        ("voxel-rcnn", ("openpcdet", "voxel-rcnn")),
+        ("second-small", ("openpcdet", "second-small")),
+        ("module:Class", ("module:Class", None)),
+        ("unknown", ("unknown", None)),
+    ],
+)
+def test_a_preset_names_its_detector(name: str, expected: tuple) -> None:
+    assert detector_and_preset(name) == expected

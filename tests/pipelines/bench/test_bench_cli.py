@@ -19,7 +19,7 @@ from pipelines.bench.cell import run_job
 from pipelines.bench.grid import Job, jobs
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, read_result, write_result
-from pipelines.bench.settings import Bench, read_bench
+from pipelines.bench.settings import Bench, claim, read_bench
 from pipelines.engine.plan import Plan
 from pipelines.engine.stage import RoundContext, Teacher
 from pipelines.round import graph_of
@@ -236,3 +236,29 @@ def test_the_command_of_a_single_cell_is_hidden(curate: Curate) -> None:
     assert code == 0
     assert " bench " in out
     assert "bench-cell" not in out
+
+
+def test_a_preset_is_a_detector_of_a_bench(
+    toy_kitti: Path, tmp_path: Path, curate: Curate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wrong name is rejected before anything is simulated."""
+    code, _, err = curate("bench", tmp_path / "wrong", "--detector", "voxel-rcn")
+    assert code == 2
+    assert "unknown detector 'voxel-rcn'" in err
+    assert not (tmp_path / "wrong").exists()
+    monkeypatch.setattr("pipelines.commands.bench._run", lambda bench, *_, **__: claim(bench))
+    options = (
+        "--data",
+        toy_kitti,
+        "--detector",
+        "voxel-rcnn-small",
+        "--set",
+        "detector.minimum_score=0.02",
+    )
+    code, _, err = curate("bench", tmp_path / "bench", *options)
+    assert code == 0, err
+    bench = read_bench(tmp_path / "bench")
+    assert bench is not None
+    config = bench.config(0)
+    assert (config.detector.name, config.train.preset) == ("openpcdet", "voxel-rcnn-small")
+    assert config.detector.minimum_score == 0.02
