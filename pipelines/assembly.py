@@ -26,6 +26,7 @@ from curate.errors import ConfigError, CurateError, DataError, error_prefix
 from curate.exporters.base import DataToExport, Selective
 from curate.files.onnx_providers import CPU
 from curate.files.toml_text import toml_key
+from curate.files.user_command import UserCommand
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
@@ -97,8 +98,12 @@ def fill_round(folder: Path, round_number: int) -> Path:
     return Path(str(folder).replace("{round}", str(round_number)))
 
 
-def check_detector(config: Config) -> None:
+def check_detector(config: Config, root: Path = Path()) -> None:
     """Check that the detector's class can be used with its options, without loading a model.
+
+    Args:
+        config: the configuration.
+        root: folder of the workspace, in which a command runs; it need not exist yet.
 
     Raises:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
@@ -120,8 +125,19 @@ def check_detector(config: Config) -> None:
         )
     check_detector_place(config)
     if runs_elsewhere(config):
-        open_detector(config, config.detector.path)
+        open_detector(config, config.detector.path, Place(root, 1))
     trainable_detector(config)
+
+
+def trainer_command(command: str, root: Path) -> UserCommand:
+    """Return the command of the user's trainer, which runs in the folder of the workspace.
+
+    Raises:
+        ConfigError: if it cannot be parsed or started.
+    """
+    parsed = UserCommand.parse("train command", command)
+    parsed.check(root)
+    return parsed
 
 
 def runs_elsewhere(config: Config) -> bool:
@@ -464,13 +480,20 @@ def check_labels_format(config: Config, dataset: Dataset | None = None) -> None:
                 exporter.check_data(DataToExport(frame, images, config.dataset.categories))
 
 
-def check_extensions(config: Config) -> None:
-    """Check every class that the configuration refers to, without loading a model.
+def check_extensions(config: Config, root: Path) -> None:
+    """Check every class and command of the configuration, without loading a model.
+
+    Args:
+        config: the configuration.
+        root: folder of the workspace, in which commands run; it need not exist yet.
 
     Raises:
-        ConfigError: if a class cannot be imported or does not accept its options.
+        ConfigError: if a class cannot be imported or does not accept its options, or a command
+            cannot be started.
     """
-    check_detector(config)
+    check_detector(config, root)
+    if config.train.command is not None:
+        trainer_command(config.train.command, root)
     check_segmenter(config)
     check_policy(config, config.run.method)
     check_executor(config)

@@ -66,7 +66,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
         frame = workspace.dataset.read(name, image=semantic)
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
-    findings = [*_guarded("devices", lambda: _devices(workspace.config, semantic=semantic))]
+    findings = [*_guarded("devices", lambda: _devices(workspace, semantic=semantic))]
     findings += [*_names(find_differences(workspace)), *examine_frame(frame)]
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
@@ -97,9 +97,10 @@ def report_wrong_inputs(workspace: Workspace) -> None:
             _log.warning("%s: %s; see `curate doctor`", finding.check, finding.message)
 
 
-def _devices(config: Config, *, semantic: bool) -> Sequence[Finding]:
+def _devices(workspace: Workspace, *, semantic: bool) -> Sequence[Finding]:
     """Report where the models run."""
-    check_detector(config)
+    config = workspace.config
+    check_detector(config, workspace.root)
     if semantic:
         check_segmenter(config)
     places = {"detector": detector_place(config)}

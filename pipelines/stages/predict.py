@@ -329,7 +329,7 @@ def check(workspace: Workspace) -> None:
         ConfigError: if it cannot.
     """
     config = workspace.config
-    check_detector(config)
+    check_detector(config, workspace.root)
     option_files(workspace)
     command = config.detector.options.get("command", "")
     ignores_students = "{" in command and "{teacher}" not in command

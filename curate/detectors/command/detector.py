@@ -27,7 +27,7 @@ from curate.detectors.recorded import RecordedDetector
 from curate.detectors.recorded.formats import check_kind
 from curate.errors import ConfigError, CurateError, DataError, ModelError, one_line
 from curate.files.paths import StrPath
-from curate.files.user_command import UserCommand, describe_end, fill
+from curate.files.user_command import UserCommand, describe_end, describe_missing, fill
 from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotation_y_of_tools
@@ -58,16 +58,18 @@ class CommandDetector:
         results: how the results are read: the options of `RecordedDetector`, such as kind, classes
             and rotation_y, and `path` within {results} (a name or a pattern). Placeholders are
             replaced here too.
-        files: files that the predictions depend on, such as the configuration of the model. A
-            change of their content makes predictions outdated; the detector does not read them.
+        files: files that the predictions depend on, such as the configuration of the model,
+            relative to `folder`. A change of their content makes predictions outdated; the detector
+            does not read them.
         camera_view: whether the copies have only the points that a camera sees.
         timeout_s: seconds after which the command is ended.
         open_dataset: opens the data set.
-        folder: folder in which `batches` and `logs` are created.
+        folder: folder in which the command runs and `batches` and `logs` are created.
         round_number: number of the round, for {round}.
 
     Raises:
-        ConfigError: if the command or an option is invalid, or the program does not exist.
+        ConfigError: if the command or an option is invalid, or the program or a file does not
+            exist.
     """
 
     def __init__(
@@ -84,23 +86,29 @@ class CommandDetector:
         folder: StrPath = ".",
         round_number: int = 1,
     ) -> None:
+        self._folder = Path(folder).absolute()
         self._command = UserCommand.parse(_TITLE, command)
-        _check_command(self._command)
+        _check_placeholders(self._command)
         self._results = dict(results or {})
         _check_results(self._results)
         if isinstance(files, str):
             raise ConfigError(f'detector.options.files: write a list, ["{files}"]')
+        for name in files:
+            if not (self._folder / name).exists():
+                missing = describe_missing(name, self._folder)
+                raise ConfigError(f"detector.options.files: {missing}")
         self._path = "" if path is None else str(Path(path).absolute())
         if "teacher" in self._command.placeholders() and path is None:
             raise ConfigError(
                 f"{_TITLE}: uses {{teacher}}, but detector.path, the checkpoint of the first "
                 "round, is not set"
             )
+        self._command.check(self._folder)
         self._minimum_score = minimum_score
         self._camera_view = camera_view
         self._timeout_s = timeout_s
         self._open_dataset = open_dataset
-        self._folders = BatchFolders(Path(folder).absolute())
+        self._folders = BatchFolders(self._folder)
         self._round_number = round_number
 
     @classmethod
@@ -226,7 +234,7 @@ class CommandDetector:
         with log.open("wb") as output:
             output.write(f"$ {shlex.join(self._command.filled(values))}\n".encode())
             output.flush()
-            code = self._command.run(values, output, self._timeout_s)
+            code = self._command.run(values, output, self._timeout_s, self._folder)
         _shorten(log)
         if code == 0 and any(Path(values["results"]).iterdir()):
             return
@@ -284,11 +292,11 @@ def _moved(found: Detections | CurateError, folder: Path, kept: Path) -> Detecti
     return type(found)(name_results_options(str(found).replace(str(folder), str(kept))))
 
 
-def _check_command(command: UserCommand) -> None:
-    """Check placeholders and program; a command without placeholders reads the environment.
+def _check_placeholders(command: UserCommand) -> None:
+    """Check the placeholders of a command; without any it reads the environment.
 
     Raises:
-        ConfigError: if a placeholder is unknown or missing, or the program does not exist.
+        ConfigError: if a placeholder is unknown or missing.
     """
     command.check_placeholders(PLACEHOLDERS)
     used = command.placeholders()
@@ -302,7 +310,6 @@ def _check_command(command: UserCommand) -> None:
             f"{_TITLE}: has neither {{data}} nor {{clouds}}, the frames that it must read; add one "
             "(or use no placeholders at all, and read $CURATE_DATA)"
         )
-    command.check_program()
 
 
 def _check_results(results: Mapping[str, Any]) -> None:
