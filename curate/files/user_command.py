@@ -31,7 +31,9 @@ _DOUBLE_QUOTED = re.compile(r'"(?:\\.|[^"\\])*"')
 _VARIABLE = re.compile(r"\$(?:\w+|\{\w+[^}]*\}|\()|`|(?<![^\s:])~(?=[/\s]|\Z)|\A\s*\w+=")
 _OPERATOR = re.compile(r"(?<!\S)(?:&&|\|\|?|&|;|\d?>+(?:&\d|[^\s&]*)|&>\S*|<\S*)(?!\S)|;(?!\S)")
 # An interpreter that is followed by its script, perhaps after options without a value.
-_INTERPRETER = re.compile(r"(?:python|pypy|perl|ruby|Rscript|julia|node|sh|bash|dash|ksh|zsh)[\d.]*")
+_INTERPRETER = re.compile(
+    r"(?:python|pypy|perl|ruby|Rscript|julia|node|sh|bash|dash|ksh|zsh)[\d.]*"
+)
 _FLAG = re.compile(r"-[uISEsBbOqvxe]+")
 
 

@@ -17,7 +17,6 @@ from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.geometry.augmented_views import augmented_frame
-from curate.geometry.similarity import Similarity
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import (
     Place,
@@ -32,14 +31,17 @@ from pipelines.category_names import detector_differences, find_differences
 from pipelines.devices import detector_place, idle_gpu, segmenter_place
 from pipelines.engine.rounds import choose_round, newest_checkpoint
 from pipelines.labels.of_one_frame import find_frame
+from pipelines.stages.labeled_copies import (
+    TURNED,
+    examine_labeled_copies,
+    labeled_frames,
+)
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
 
-# A of the copy on which a detector that runs elsewhere is tried.
-_TURNED = Similarity(flip_y=True, rotation_rad=0.4, scale=1.03)
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
 # Frames with recorded results that are checked together with the frame.
@@ -153,7 +155,7 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     if isinstance(detector, RecordedDetector) and detector.lacks_copy(frame.frame_id):
         findings.append(Finding("views", "ok", "the augmented copies are those of another split"))
     elif isinstance(detector, CopiesDetector):
-        findings += _copy(detector, seen, found, config)
+        findings += _copies(workspace, detector, seen, found)
     elif isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
         findings.append(
@@ -171,11 +173,15 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     return findings
 
 
-def _copy(
-    detector: CopiesDetector, frame: Frame, found: Detections, config: Config
+def _copies(
+    workspace: Workspace, detector: CopiesDetector, frame: Frame, found: Detections
 ) -> list[Finding]:
-    """Run a detector that runs elsewhere on a turned copy of the frame, and check its boxes."""
-    [copy] = detector.predict_copies({frame.frame_id: _TURNED}, view=1)
+    """Run a detector that runs elsewhere on turned copies of the frame and of labeled frames."""
+    config = workspace.config
+    labeled = [name for name in labeled_frames(workspace) if name != frame.frame_id]
+    [copy, *others] = detector.predict_copies(
+        dict.fromkeys([frame.frame_id, *labeled], TURNED), view=1
+    )
     if isinstance(copy, CurateError):
         return [Finding("views", "wrong", str(copy))]
     copy = renamed(copy, config.detector.rename)
@@ -187,10 +193,20 @@ def _copy(
         return [Finding("views", "wrong", message)]
     wrong = [
         finding
-        for finding in examine_detections(augmented_frame(frame, _TURNED), copy, ())
+        for finding in examine_detections(augmented_frame(frame, TURNED), copy, ())
         if finding.check == "boxes" and finding.state == "wrong"
     ]
-    return wrong or [Finding("views", "ok", f"{len(copy)} boxes in a turned copy of this frame")]
+    views = wrong or [Finding("views", "ok", f"{len(copy)} boxes in a turned copy of this frame")]
+    usable = {
+        name: checked(each, config)
+        for name, each in zip(labeled, others, strict=True)
+        if not isinstance(each, CurateError)
+    }
+    problem, findings = examine_labeled_copies(config, workspace.dataset, detector, usable)
+    if problem:
+        return [*views, Finding("headings", "wrong", problem)]
+    few = f"not compared: the command finds too few objects of {len(usable)} labeled frames"
+    return [*views, *(findings or [Finding("headings", "ok", few)])]
 
 
 def _other_results(

@@ -1,9 +1,13 @@
 """Rounds with a detector that runs elsewhere: equal rows, failures, checks before the first row."""
 
 import json
+import os
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
+from contracts.samples import assert_one_line
 from support.external_detector import command_of, write_script
 from support.pipelines_cli import Curate
 from support.rounds import run_stage, run_workspace
@@ -37,6 +41,38 @@ def make(root: Path, home: Path, command: str | None = None, **settings) -> Work
     for name, section in settings.items():
         document[name] = document.get(name, {}) | section
     return initialise(root, make_config(document, "test"), "0.04", "")
+
+
+KITTI_RESULTS = """
+import sys
+from pathlib import Path
+import numpy as np
+from oracles.openpcdet_kitti import Calibration, write_results
+from support.toys import INTENSITIES, SIZES
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.geometry.mounting import rotations_y_of_yaws
+
+data, results, meaning = sys.argv[1:]
+dataset = KittiDataset(Path(data))
+for name in dataset.frame_ids():
+    frame, boxes = dataset.read(name), []
+    for category, intensity in INTENSITIES.items():
+        seen = frame.points[np.abs(frame.points[:, 3] - intensity) < 0.01, :3]
+        x, y = np.linalg.svd(seen[:, :2] - seen[:, :2].mean(axis=0))[2][0]
+        boxes.append([*seen.mean(axis=0), *SIZES[category], np.arctan2(y, x)])
+    boxes = np.array(boxes)
+    boxes[:, 6] = -np.pi / 2 - rotations_y_of_yaws(boxes[:, 6], frame.calibration, meaning)
+    calibration = Calibration(dataset.files(name).calibration)
+    scores = np.full(len(boxes), 0.9)
+    write_results(Path(results) / f"{name}.txt", boxes, scores, list(SIZES), calibration)
+"""
+
+
+def writing_rotation_y(home: Path, meaning: str) -> str:
+    """Return the command that writes KITTI result files with rotation_y of a meaning."""
+    (home / "kitti_results.py").write_text(KITTI_RESULTS)
+    program = shlex.join([sys.executable, str(home / "kitti_results.py")])
+    return f"{program} {{data}} {{results}} {meaning}"
 
 
 def with_modes(home: Path, modes: Path, *lines: str) -> str:
@@ -143,6 +179,33 @@ def test_results_of_the_original_frames_are_rejected(home: Path, tmp_path: Path)
         run_stage(workspace, "repredict")
 
 
+def test_headings_are_compared_with_labels_before_anything_is_stored(
+    curate: Curate,
+    home: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The camera looks along x, so the frames themselves do not show the meaning of rotation_y."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    document = toy_document(home / "kitti", home / "segmenter.txt")
+
+    options = {"command": writing_rotation_y(home, "calibration")}
+    document["detector"] = {"name": "command", "options": options}
+    wrong = initialise(tmp_path / "work", make_config(document, "test"), "0.5", "")
+    setting = 'set detector.options.results.rotation_y = "calibration"'
+    with pytest.raises(ModelError, match=setting) as caught:
+        run_stage(wrong, "predict")
+    assert_one_line(caught.value)
+    assert states(wrong, "predict") == {}
+    assert len(list((wrong.root / "logs").iterdir())) == 1
+    code, out, _ = curate("doctor", "-w", wrong.root)
+    assert (code, setting in out) == (1, True)
+    options |= {"results": {"rotation_y": "calibration"}}
+    assert run_stage(wrong.with_settings("detector", options=options), "predict").failed == 0
+    assert "turned copies of labeled frames" not in caplog.text
+
+
 def test_predictions_depend_on_command_files_and_teacher_but_not_on_time_limits(
     home: Path, tmp_path: Path
 ) -> None:
@@ -197,7 +260,7 @@ def test_mistakes_are_found_by_init_and_doctor(curate: Curate, home: Path, tmp_p
     assert code == 0, err
     code, out, err = curate("doctor", "-w", tmp_path / "work", "--json")
     findings = {(each["check"], each["state"]) for each in json.loads(out)["findings"]}
-    assert ("views", "ok") in findings, out + err
+    assert {("views", "ok"), ("headings", "ok")} <= findings, out + err
 
 
 def test_evaluate_runs_the_command_on_val_frames(
