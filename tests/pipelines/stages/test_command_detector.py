@@ -164,6 +164,21 @@ def test_failures_in_a_row_end_the_run(home: Path, tmp_path: Path) -> None:
     assert states(workspace, "predict") == {"done": TRIAL_FRAMES, "failed": 6}
 
 
+@pytest.mark.parametrize("modes", [["", "", "exit", "exit", "exit"], ["", "", "", "exit", "exit"]])
+def test_failures_at_the_end_of_a_run_count_as_those_before(
+    home: Path, tmp_path: Path, modes: list[str]
+) -> None:
+    """Fifteen frames after the trial in batches of 4, 4, 4 and 3: the last batch is small."""
+    command = with_modes(home, tmp_path / "modes", *modes)
+    workspace = make(tmp_path / "work", home, command).with_settings("detector", batch_size=4)
+    if modes.count("exit") < 3:
+        assert run_stage(workspace, "predict").failed == 7
+        return
+    with pytest.raises(ModelError, match="11 frames in a row failed"):
+        run_stage(workspace, "predict")
+    assert states(workspace, "predict") == {"done": TRIAL_FRAMES + 4, "failed": 11}
+
+
 def test_results_of_the_original_frames_are_rejected(home: Path, tmp_path: Path) -> None:
     """A command that reads the data set, not the copies, would show perfect consistency."""
     script = home / "my detector" / "infer.py"
