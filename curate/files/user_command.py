@@ -73,7 +73,7 @@ class UserCommand:
 
     def placeholders(self) -> list[str]:
         """Return the names in braces, in order."""
-        return [name for each in self.arguments for name in _PLACEHOLDER.findall(each)]
+        return [name for each in self.arguments for name in placeholders(each)]
 
     def check_placeholders(self, known: Collection[str]) -> None:
         """Raise ConfigError if a name in braces is not known."""
@@ -173,6 +173,11 @@ class UserCommand:
                     with suppress(BrokenPipeError):
                         process.stdin.close()
                 process.wait()
+
+
+def placeholders(text: str) -> list[str]:
+    """Return the names in braces in a text, in order."""
+    return _PLACEHOLDER.findall(text)
 
 
 def fill(text: str, values: Mapping[str, str]) -> str:

@@ -38,6 +38,7 @@ from pipelines.stages.labeled_copies import (
 )
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
+from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
@@ -138,7 +139,8 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     number, _ = choose_round(workspace, None, None)
-    place = Place(workspace.root, number, copies=True)
+    split = next(each for each in SPLITS if frame.frame_id in workspace.frames(each))
+    place = Place(workspace.root, number, copies=split)
     detector = open_detector(config, newest_checkpoint(workspace), place)
     missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)

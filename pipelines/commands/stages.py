@@ -65,6 +65,7 @@ def run_frame_command(
     if dry_run:
         outside = outside_rounds(workspace)
         context = outside if round_number == 0 else preview_round(workspace, round_number)
+        context = replace(context, split=split)
         check_inputs(Plan(workspace, context, graph), selected, split)
         preview = Preview(workspace, graph, context.number, context)
         planned = (preview.frames_stage(stage, split, alone=True) for stage in selected)
@@ -73,7 +74,8 @@ def run_frame_command(
     if round_number == 0:
         plan = Plan(workspace, outside_rounds(workspace), graph)
     else:
-        plan = Plan(workspace, open_round(workspace, round_number), graph)
+        context = replace(open_round(workspace, round_number), split=split)
+        plan = Plan(workspace, context, graph)
     check_inputs(plan, selected, split)
     reports = []
     with open_executor(workspace) as work:

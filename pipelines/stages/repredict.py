@@ -38,7 +38,7 @@ class Repredict(Predict):
     """Predicts augmented copies of frames, and compares them with the frames' predictions."""
 
     def __init__(self, predict: Predict, seed: int) -> None:
-        super().__init__(predict.config, predict.teacher, replace(predict.place, copies=True))
+        super().__init__(predict.config, predict.teacher, predict.place)
         self.seed = seed
 
     @property
@@ -161,14 +161,14 @@ class Repredict(Predict):
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
     """Return what repredictions depend on besides predictions and teacher."""
     section = workspace.config.repredict.model_dump(mode="json")
-    folder = copies_folder(workspace.config, context.number)
+    folder = copies_folder(workspace.config, context.number, context.split)
     copies = {} if folder is None else {"copies": copies_fingerprint(folder)}
     return {**section, **copies, "seed": context.seed, "round": context.number}
 
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:
     """Return what repredict does with a frame."""
-    place = Place(workspace.root, context.number)
+    place = Place(workspace.root, context.number, copies=context.split)
     return Repredict(Predict(workspace.config, context.teacher.path, place), context.seed)
 
 

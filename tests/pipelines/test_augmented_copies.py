@@ -365,6 +365,51 @@ def test_other_splits(curate: Curate, work: Path, split: str) -> None:
     assert not list((work / "copies").rglob("label_2"))
 
 
+def test_every_split_has_copies_of_its_own(curate: Curate, work: Path, tmp_path: Path) -> None:
+    """{split} in the command and in the setting: an audit leaves the repredictions of a run."""
+    for split in ("unlabeled", "labeled"):
+        code, out, err = curate("augment", work / "{split}/{round}", "-w", work, "--split", split)
+        assert code == 0, err
+        assert out.endswith('augmented = "{split}/{round}"\n')
+        for view in (work / split / "1").glob("view-*"):
+            detect(RayDetector(empty(tmp_path)), view, view / "results")
+    set_augmented(work, "{split}/{round}")
+    assert curate("run", "-w", work)[0] == 0
+    code, out, err = curate("audit", "--split", "labeled", "-w", work, "--json")
+    assert code == 0, err
+    sql = (
+        "SELECT split, count(*) AS n FROM consistency JOIN frame ON frame.id = frame_id GROUP BY 1"
+    )
+    assert {row["split"] for row in query(curate, work, sql)} == {"labeled", "unlabeled"}
+    _, out, _ = curate("run", "--dry-run", "--json", "-w", work)
+    assert [each for each in json.loads(out)["stages"] if each["reasons"]] == []
+    name = query(curate, work, "SELECT frame FROM frame WHERE split = 'labeled'")[0]["frame"]
+    code, out, _ = curate("doctor", name, "-w", work)
+    assert "2 recorded augmented copies of this frame" in out
+    set_augmented(work, "{splits}")
+    for command in (["run"], ["doctor"]):
+        out = "".join(map(str, curate(*command, "-w", work)))
+        assert "{splits}: unknown placeholder {splits}; did you mean 'split'?" in out
+
+
+def test_a_folder_in_which_copies_cannot_be_is_found_at_the_start(
+    curate: Curate, work: Path, data: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for folder, message in {
+        data / "training/copies": f"is in the data set {data}",
+        tmp_path / "{policy}": "unknown placeholder {policy}; it has {round} and {split}",
+        tmp_path / "file/copies/1": f"{tmp_path}/file is not a folder",
+        tmp_path / "link": f"{tmp_path}/link is not a folder",
+    }.items():
+        for more in ([], ["--dry-run"]):
+            code, _, err = curate("augment", folder, "-w", work, *more)
+            assert (code, err.count("\n")) == (2, 1)
+            assert message in err
+    assert not (data / "training/copies").exists()
+
+
 def test_what_would_be_written(curate: Curate, work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dry run writes nothing; a disk that is too small is found before the first file."""
     code, out, _ = curate("augment", work / "copies", "-w", work, "--dry-run")
