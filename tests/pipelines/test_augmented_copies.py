@@ -366,7 +366,7 @@ def test_other_splits(curate: Curate, work: Path, split: str) -> None:
 
 
 def test_every_split_has_copies_of_its_own(curate: Curate, work: Path, tmp_path: Path) -> None:
-    """{split} in the command and in the setting: an audit leaves the repredictions of a run."""
+    """{split} in the command and in the setting: results of one split leave those of another."""
     for split in ("unlabeled", "labeled"):
         code, out, err = curate("augment", work / "{split}/{round}", "-w", work, "--split", split)
         assert code == 0, err
@@ -374,15 +374,13 @@ def test_every_split_has_copies_of_its_own(curate: Curate, work: Path, tmp_path:
         for view in (work / split / "1").glob("view-*"):
             detect(RayDetector(empty(tmp_path)), view, view / "results")
     set_augmented(work, "{split}/{round}")
-    assert curate("run", "-w", work)[0] == 0
-    code, out, err = curate("audit", "--split", "labeled", "-w", work, "--json")
-    assert code == 0, err
-    sql = (
-        "SELECT split, count(*) AS n FROM consistency JOIN frame ON frame.id = frame_id GROUP BY 1"
-    )
-    assert {row["split"] for row in query(curate, work, sql)} == {"labeled", "unlabeled"}
-    _, out, _ = curate("run", "--dry-run", "--json", "-w", work)
-    assert [each for each in json.loads(out)["stages"] if each["reasons"]] == []
+    for split in ("unlabeled", "labeled"):
+        for command in ("predict", "repredict"):
+            code, _, err = curate(command, "--split", split, "-w", work)
+            assert code == 0, err
+    for split in ("unlabeled", "labeled"):
+        out = curate("repredict", "--split", split, "--dry-run", "--json", "-w", work)[1]
+        assert [each["frames"] for each in json.loads(out)["stages"]] == [0]
     name = query(curate, work, "SELECT frame FROM frame WHERE split = 'labeled'")[0]["frame"]
     code, out, _ = curate("doctor", name, "-w", work)
     assert "2 recorded augmented copies of this frame" in out

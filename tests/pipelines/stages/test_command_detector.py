@@ -14,7 +14,7 @@ from support.rounds import run_stage, run_workspace
 from support.stored_rows import dump, rows
 from support.toys import toy_document, write_toy_kitti
 
-from curate.errors import ConfigError, FramesFailed, ModelError
+from curate.errors import ConfigError, FramesFailed, ModelError, WorkspaceError
 from pipelines.round import open_plan
 from pipelines.stages import predict, repredict
 from pipelines.stages.predict import TRIAL_FRAMES
@@ -252,15 +252,37 @@ def test_predictions_depend_on_command_files_and_teacher_but_not_on_time_limits(
         predict.check(missing)
 
 
+def test_a_stage_without_its_input_names_the_command_that_makes_it(
+    curate: Curate, home: Path, tmp_path: Path
+) -> None:
+    """Also after a change of the detector's options, which makes its predictions outdated."""
+    workspace = make(tmp_path / "work", home)
+    root = workspace.root
+    hint = "run `curate predict --split labeled` first, or `curate run` for all stages"
+    for more in ([], ["--dry-run"]):
+        code, _, err = curate("repredict", "--split", "labeled", "-w", root, *more)
+        assert (code, err.count("\n")) == (WorkspaceError.exit_code, 1)
+        assert "predict of 1 labeled frames in round 1 is missing or out of date" in err
+        assert hint in err
+    assert curate("predict", "--split", "labeled", "-w", root)[0] == 0
+    assert curate("repredict", "--split", "labeled", "-w", root)[0] == 0
+    config = root / "curate.toml"
+    config.write_text(config.read_text().replace("{clouds}", "{clouds} "))
+    config.write_text(config.read_text().replace("{results}", "{results} ''"))
+    for command in ("repredict", "score"):
+        code, _, err = curate(command, "--split", "labeled", "-w", root)
+        assert (code, hint in err) == (WorkspaceError.exit_code, True)
+
+
 def test_mistakes_are_found_by_init_and_doctor(curate: Curate, home: Path, tmp_path: Path) -> None:
     """`init` knows the program and the placeholders, `doctor` runs the command on a frame."""
     script = home / "my detector" / "infer.py"
 
-    def init(command: str) -> tuple[int, str, str]:
+    def init(command: str, *more: str) -> tuple[int, str, str]:
         return curate(
             "init", tmp_path / "work", "--root", home / "kitti", "--labeled", "0.1",
             "--detector", "command", "--set", f"detector.options.command={command}",
-            "--set", 'run.priors=["points"]',
+            "--set", 'run.priors=["points"]', *more,
         )  # fmt: skip
 
     for command, reason in {
@@ -270,12 +292,25 @@ def test_mistakes_are_found_by_init_and_doctor(curate: Curate, home: Path, tmp_p
         code, _, err = init(command)
         assert (code, err.count("\n")) == (ConfigError.exit_code, 1)
         assert reason in err
+    for setting, reason in {
+        "detector.options.command=python infer.py {data} {results}": "infer.py: no such file",
+        "detector.options.files=['model.yaml']": "model.yaml: no such file",
+        "train.command=cd x && python train.py": "train command: `&&` is shell syntax",
+    }.items():
+        code, _, err = init(command_of(script), "--set", setting)
+        assert (code, err.count("\n")) == (ConfigError.exit_code, 1)
+        assert reason in err
     assert not (tmp_path / "work").exists()
-    code, _, err = init(command_of(script))
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "model.yaml").touch()
+    code, _, err = init(command_of(script), "--set", "detector.options.files=['model.yaml']")
     assert code == 0, err
     code, out, err = curate("doctor", "-w", tmp_path / "work", "--json")
     findings = {(each["check"], each["state"]) for each in json.loads(out)["findings"]}
     assert {("views", "ok"), ("headings", "ok")} <= findings, out + err
+    (tmp_path / "work" / "model.yaml").unlink()
+    _, out, _ = curate("doctor", "-w", tmp_path / "work")
+    assert "model.yaml: no such file" in out
 
 
 def test_evaluate_runs_the_command_on_val_frames(
