@@ -160,10 +160,14 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
         findings += _copies(workspace, detector, seen, found)
     elif isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
+        empty = len(found) > 0 and not any(len(detections) for _, detections in views)
+        recorded = f"{len(views)} recorded augmented copies of this frame"
         findings.append(
-            Finding("views", "ok", f"{len(views)} recorded augmented copies of this frame")
-            if views
-            else _no_views(config)
+            _no_views(config)
+            if not views
+            else Finding("views", "suspect", f"{recorded}, but no box in any of them")
+            if empty
+            else Finding("views", "ok", recorded)
         )
         for similarity, detections in views:
             augmented = augmented_frame(seen, similarity)
@@ -198,7 +202,9 @@ def _copies(
         for finding in examine_detections(augmented_frame(frame, TURNED), copy, ())
         if finding.check == "boxes" and finding.state == "wrong"
     ]
-    views = wrong or [Finding("views", "ok", f"{len(copy)} boxes in a turned copy of this frame")]
+    state = "ok" if len(copy) or not len(found) else "suspect"
+    message = f"{len(copy)} boxes in a turned copy of this frame, {len(found)} in the frame"
+    views = wrong or [Finding("views", state, message)]
     usable = {
         name: checked(each, config)
         for name, each in zip(labeled, others, strict=True)

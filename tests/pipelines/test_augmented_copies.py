@@ -283,6 +283,28 @@ def test_headings_in_another_convention_are_found(
     assert code == 0, err
 
 
+def test_messages_name_the_results_of_the_view_that_is_wrong(
+    curate: Curate, work: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Frame names, category names, and results without any box; those of the frames are right."""
+    results = augment_and_detect(curate, work, tmp_path) / "view-1/results"
+    right = {path.name: path.read_text() for path in results.iterdir()}
+    for path in results.iterdir():
+        path.rename(results / f"x{path.name}")
+    code, _, err = curate("run", "-w", work)
+    assert (code, f"{results}: results for frames that do not exist (x0" in err) == (3, True)
+    for path in results.iterdir():
+        path.unlink()
+    for name, text in right.items():
+        (results / name).write_text(text.replace("Pedestrian", "pedestrian"))
+    code, _, err = curate("run", "-w", work)
+    assert (code, f"the results {results} have pedestrian, but" in err) == (2, True)
+    for name in right:
+        (results / name).write_text("")
+    assert curate("repredict", "-w", work)[0] == 0
+    assert f"{results}: no boxes in 16 copies, but 48 in their frames" in caplog.text
+
+
 def test_missing_results_are_counted_at_the_start(
     curate: Curate, work: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

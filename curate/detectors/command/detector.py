@@ -20,11 +20,12 @@ from typing import Any
 
 from curate.datasets.base import Dataset
 from curate.datasets.copies import copy_writer
+from curate.datasets.frame_names import FrameNames
 from curate.detections import Detections
 from curate.detectors.command.batch_folders import BatchFolders
 from curate.detectors.option_names import name_results_options, results_options_named
 from curate.detectors.recorded import RecordedDetector
-from curate.detectors.recorded.formats import check_kind
+from curate.detectors.recorded.formats import SUFFIXES, check_kind
 from curate.errors import ConfigError, CurateError, DataError, ModelError, one_line
 from curate.files.paths import StrPath
 from curate.files.user_command import UserCommand, describe_end, describe_missing, fill
@@ -264,7 +265,8 @@ class CommandDetector:
         for key, value in self._results.items():
             if isinstance(value, str):
                 options[key] = fill(value, values)
-        path = _result_path(Path(values["results"]), options.pop("path", None), copies)
+        path, kind = _find_results(Path(values["results"]), options.pop("path", None), copies)
+        options.setdefault("kind", kind)
         with results_options_named():
             return RecordedDetector(
                 path,
@@ -331,8 +333,13 @@ def _check_results(results: Mapping[str, Any]) -> None:
         )
 
 
-def _result_path(results: Path, pattern: str | None, frame_ids: Collection[str]) -> Path:
-    """Return the file or folder of the results: {results}, its only file, or what a pattern fits.
+def _find_results(
+    results: Path, pattern: str | None, frame_ids: Collection[str]
+) -> tuple[Path, str]:
+    """Return the file or folder of the results, and its kind if the names of the files show it.
+
+    The results are what a pattern fits, or the only file, or the files with names of frames, or
+    the only file that can hold the results of several frames: there may be logs beside it.
 
     Raises:
         ModelError: if nothing or several paths fit.
@@ -345,12 +352,26 @@ def _result_path(results: Path, pattern: str | None, frame_ids: Collection[str])
                 f"{results}: {shown} fits detector.options.results.path = {pattern!r}; one result "
                 "was expected"
             )
-        return found[0]
+        return found[0], "auto"
     files = [each for each in results.iterdir() if not each.name.startswith(".")]
     if len(files) == 1 and files[0].is_file() and files[0].stem not in frame_ids:
-        return files[0]
-    if any(each.suffix in (".txt", ".json") for each in results.rglob("*")):
-        return results  # a file per frame
+        return files[0], "auto"
+    separate = [each for each in results.rglob("*") if each.suffix in (".txt", ".json")]
+    frames = FrameNames(frame_ids)
+    of_frames = [
+        each for each in separate if frames.find(each.relative_to(results).as_posix()) is not None
+    ]
+    suffixes = {each.suffix for each in of_frames}
+    parents = {each.parent for each in of_frames}
+    if suffixes == {".txt"}:
+        return results, "kitti"
+    if suffixes == {".json"} and len(parents) == 1:
+        return parents.pop(), "mmdetection3d"
+    whole = [each for each in files if each.suffix.lower() in SUFFIXES and each.is_file()]
+    if not suffixes and len(whole) == 1:
+        return whole[0], "auto"
+    if separate and not whole:
+        return results, "auto"  # under other names than those of the frames: the error lists them
     names = ", ".join(sorted(each.name for each in files)[:3])
     raise ModelError(
         f"{results}: contains {names}; set detector.options.results.path to the file of the results"
