@@ -532,7 +532,8 @@ class TrainSection(Section):
     )
     command: str | None = Field(
         default=None,
-        description="Command of your own trainer; see docs/training.md.",
+        description="Command of your own trainer, which runs in the folder of the workspace; see "
+        "docs/training.md.",
         examples=["python train.py {labels} {output}"],
     )
     labels_format: ExporterName = Field(
