@@ -89,9 +89,14 @@ def check_copies(workspace: Workspace, context: RoundContext, split: str) -> Non
     if folder is None or not frames:
         return
     expected = manifest_of(workspace, context.number, split)
+    command = f"curate augment FOLDER --round {context.number} --split {split}"
+    if not (folder / NAME).exists():
+        raise DataError(
+            f"{folder / NAME}: no such file; write the copies with `{command}`, or correct "
+            "detector.augmented"
+        )
     difference = Manifest.read(folder).difference(expected)
     if difference:
-        command = f"curate augment FOLDER --round {context.number} --split {split}"
         several = "" if "{split}" in str(workspace.config.detector.augmented) else _SEVERAL
         raise DataError(
             f"{folder / NAME}: {difference}; write the copies with `{command}`{several}"
