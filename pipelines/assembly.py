@@ -26,6 +26,7 @@ from curate.errors import ConfigError, CurateError, DataError, error_prefix
 from curate.exporters.base import DataToExport, Selective
 from curate.files.onnx_providers import CPU
 from curate.files.toml_text import toml_key
+from curate.files.user_command import UserCommand, fill, placeholders
 from curate.frames import Calibration
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
@@ -33,6 +34,7 @@ from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import DeclaresClasses, Segmenter
 from curate.segmenters.map_store import MapStore, StoringSegmenter
 from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
+from curate.spelling import did_you_mean
 from curate.weighting.base import Policy
 from pipelines import registry
 from pipelines.devices import (
@@ -56,13 +58,13 @@ class Place:
     Attributes:
         folder: folder of the workspace.
         round_number: number e of the round.
-        copies: whether it predicts the augmented copies; results in `detector.augmented` are read
-            only then.
+        copies: split of the frames with augmented copies that it predicts; results in
+            `detector.augmented` are read only then. None if it predicts the frames themselves.
     """
 
     folder: Path
     round_number: int
-    copies: bool = False
+    copies: str | None = None
 
 
 def open_detector(config: Config, path: Path | None, place: Place | None = None) -> Detector:
@@ -78,27 +80,46 @@ def open_detector(config: Config, path: Path | None, place: Place | None = None)
     if place is not None:
         number = place.round_number
         offered |= {"folder": lambda: place.folder, "round_number": lambda: number}
-        if place.copies:
-            offered["augmented"] = lambda: copies_folder(config, number)
+        if split := place.copies:
+            offered["augmented"] = lambda: copies_folder(config, number, split)
     detector: Detector = registry.DETECTORS.build(
         section.name, path, offered=offered, options=section.options
     )
     return detector
 
 
-def copies_folder(config: Config, round_number: int) -> Path | None:
-    """Return the folder of a round's augmented copies in `detector.augmented`; None if unset."""
+def copies_folder(config: Config, round_number: int, split: str) -> Path | None:
+    """Return the folder of augmented copies in `detector.augmented`; None if unset.
+
+    Raises:
+        ConfigError: if it has an unknown placeholder.
+    """
     folder = config.detector.augmented
-    return None if folder is None else fill_round(folder, round_number)
+    return None if folder is None else fill_folder(folder, round_number, split)
 
 
-def fill_round(folder: Path, round_number: int) -> Path:
-    """Return a folder with the number of the round in place of {round}."""
-    return Path(str(folder).replace("{round}", str(round_number)))
+def fill_folder(folder: Path, round_number: int, split: str) -> Path:
+    """Return a folder of augmented copies with {round} and {split} replaced.
+
+    Raises:
+        ConfigError: if it has another placeholder.
+    """
+    values = {"round": str(round_number), "split": split}
+    for name in placeholders(str(folder)):
+        if name not in values:
+            raise ConfigError(
+                f"{folder}: unknown placeholder {{{name}}}{did_you_mean(name, values)}; it has "
+                "{round} and {split}"
+            )
+    return Path(fill(str(folder), values))
 
 
-def check_detector(config: Config) -> None:
+def check_detector(config: Config, root: Path = Path()) -> None:
     """Check that the detector's class can be used with its options, without loading a model.
+
+    Args:
+        config: the configuration.
+        root: folder of the workspace, in which a command runs; it need not exist yet.
 
     Raises:
         ConfigError: if it cannot be imported, does not accept its options, or does not have the
@@ -111,6 +132,8 @@ def check_detector(config: Config) -> None:
             f"detector.augmented is for recorded results, but detector '{config.detector.name}' "
             "predicts the copies itself; remove the setting"
         )
+    with error_prefix("detector.augmented"):
+        copies_folder(config, 1, "unlabeled")
     with error_prefix("detector.name"):
         registry.DETECTORS.check(
             config.detector.name,
@@ -120,8 +143,19 @@ def check_detector(config: Config) -> None:
         )
     check_detector_place(config)
     if runs_elsewhere(config):
-        open_detector(config, config.detector.path)
+        open_detector(config, config.detector.path, Place(root, 1))
     trainable_detector(config)
+
+
+def trainer_command(command: str, root: Path) -> UserCommand:
+    """Return the command of the user's trainer, which runs in the folder of the workspace.
+
+    Raises:
+        ConfigError: if it cannot be parsed or started.
+    """
+    parsed = UserCommand.parse("train command", command)
+    parsed.check(root)
+    return parsed
 
 
 def runs_elsewhere(config: Config) -> bool:
@@ -464,13 +498,20 @@ def check_labels_format(config: Config, dataset: Dataset | None = None) -> None:
                 exporter.check_data(DataToExport(frame, images, config.dataset.categories))
 
 
-def check_extensions(config: Config) -> None:
-    """Check every class that the configuration refers to, without loading a model.
+def check_extensions(config: Config, root: Path) -> None:
+    """Check every class and command of the configuration, without loading a model.
+
+    Args:
+        config: the configuration.
+        root: folder of the workspace, in which commands run; it need not exist yet.
 
     Raises:
-        ConfigError: if a class cannot be imported or does not accept its options.
+        ConfigError: if a class cannot be imported or does not accept its options, or a command
+            cannot be started.
     """
-    check_detector(config)
+    check_detector(config, root)
+    if config.train.command is not None:
+        trainer_command(config.train.command, root)
     check_segmenter(config)
     check_policy(config, config.run.method)
     check_executor(config)

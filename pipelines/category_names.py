@@ -58,19 +58,21 @@ def detector_differences(config: Config, detector: Detector) -> list[NameFinding
     """Return the differences between a detector's names and `dataset.categories`."""
     if not isinstance(detector, NamesCategories):
         return []
-    names, recorded = sorted(detector.category_names()), config.detector.name == "recorded"
-    title = f"the results {config.detector.path}" if recorded else "the detector's outputs"
-    if recorded and not names:
-        return [NameFinding(False, f"{title} have no boxes: every frame will be empty")]
-    return compare_names(
-        NamedSide(
-            title,
-            names,
-            "detector.rename",
-            config.detector.rename or {},
-        ),
-        config.dataset.categories,
-    )
+    from curate.detectors.recorded import RecordedDetector
+
+    names, title = sorted(detector.category_names()), "the detector's outputs"
+    rename = config.detector.rename or {}
+    if isinstance(detector, RecordedDetector):
+        of_path = detector.names_by_path()
+        if not names:
+            message = f"the results {detector.path} have no boxes: every frame will be empty"
+            return [NameFinding(False, message)]
+        # The results with a name that is not a category: perhaps only those of a view.
+        known = {*config.dataset.categories, *rename}
+        path = next((path for path, own in of_path.items() if own - known), detector.path)
+        title = f"the results {path}"
+    side = NamedSide(title, names, "detector.rename", rename)
+    return compare_names(side, config.dataset.categories)
 
 
 def check_before_init(config: Config) -> Detector | None:

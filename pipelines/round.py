@@ -136,6 +136,12 @@ def graph_of(workspace: Workspace) -> Graph:
     )
 
 
-def open_plan(workspace: Workspace, number: int | None = None, rounds: int | None = None) -> Plan:
-    """Return the plan of a round, see `open_round`."""
-    return Plan(workspace, open_round(workspace, number, rounds), graph_of(workspace))
+def open_plan(
+    workspace: Workspace,
+    number: int | None = None,
+    rounds: int | None = None,
+    split: str = "unlabeled",
+) -> Plan:
+    """Return the plan of a round for the frames of a split, see `open_round`."""
+    context = replace(open_round(workspace, number, rounds), split=split)
+    return Plan(workspace, context, graph_of(workspace))

@@ -22,6 +22,7 @@ become a data set of single frames.
 
 import contextlib
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -31,11 +32,12 @@ from curate.datasets.base import Dataset
 from curate.datasets.formats.containment import check_frame_id
 from curate.datasets.formats.moved_clouds import Keep, move_cloud
 from curate.datasets.formats.point_layout import PointLayout
-from curate.datasets.kitti.calibration import write_calibration
+from curate.datasets.kitti.calibration import is_written_calibration, write_calibration
+from curate.errors import DataError
 from curate.files.atomic import replace_file
-from curate.files.links import link_file
+from curate.files.links import is_linked, link_file
 from curate.files.toml_text import toml, toml_key
-from curate.frames import Camera, Frame
+from curate.frames import Calibration, Camera, Frame
 from curate.geometry.augmented_views import augmented_frame
 from curate.geometry.projection import in_camera_view
 from curate.geometry.similarity import Similarity
@@ -65,7 +67,11 @@ class CopyWriter(Protocol):
         ...
 
     def is_written(self, frame_id: str) -> bool:
-        """Return whether the copy of a frame is complete."""
+        """Return whether the copy of a frame is complete.
+
+        Points are the last file and whole if they are there. Of the others, existence and size
+        count.
+        """
         ...
 
     def write(self, frame_id: str) -> None:
@@ -205,8 +211,13 @@ class KittiCopies(_Copies):
             (self._folder / "testing").symlink_to(self._home.name)
 
     def is_written(self, frame_id: str) -> bool:
-        """Return whether the copy has points, which are its last file."""
-        return self._points(self._home / "velodyne", frame_id).exists()
+        """Return whether the copy is complete."""
+        image = self._dataset.files(frame_id).image
+        return (
+            self._points(self._home / "velodyne", frame_id).exists()
+            and is_written_calibration(self._home / "calib" / f"{frame_id}.txt")
+            and (image is None or is_linked(image, self._image(image, frame_id)))
+        )
 
     def write(self, frame_id: str) -> None:
         """Write calibration, image and points of a copy."""
@@ -215,9 +226,12 @@ class KittiCopies(_Copies):
         write_calibration(self._home / "calib" / f"{frame_id}.txt", copied.calibration)
         image = self._dataset.files(frame_id).image
         if image is not None:
-            name = f"{frame_id}{image.suffix}"
-            link_file(image, self._home / f"image_{self._camera}" / name)
+            link_file(image, self._image(image, frame_id))
         self._write_points(self._points(self._home / "velodyne", frame_id), frame)
+
+    def _image(self, image: Path, frame_id: str) -> Path:
+        """Return the path of a copy's image."""
+        return self._home / f"image_{self._camera}" / f"{frame_id}{image.suffix}"
 
 
 class FolderCopies(_Copies):
@@ -237,24 +251,52 @@ class FolderCopies(_Copies):
         replace_file(self._folder / "dataset.toml", self._description().encode())
 
     def is_written(self, frame_id: str) -> bool:
-        """Return whether the copy has points, which are its last file."""
-        return self._points(self._folder / "points", frame_id).exists()
+        """Return whether the copy is complete."""
+        images = self._dataset.files(frame_id).images
+        return (
+            self._points(self._folder / "points", frame_id).exists()
+            and all(
+                is_written_calibration(path) for path in self._calibrations(self._first, frame_id)
+            )
+            and all(
+                is_linked(image, self._image(image, camera, frame_id))
+                for camera, image in zip(self._first.cameras, images, strict=False)
+            )
+        )
 
     def write(self, frame_id: str) -> None:
         """Write calibrations, images and points of a copy."""
         frame = self._dataset.read(frame_id)  # checks all its files
         copied = self._calibrated(frame)
         images = self._dataset.files(frame_id).images
-        for number, camera in enumerate(copied.cameras):
-            path = self._folder / "calib" / camera.name / f"{frame_id}.txt"
-            write_calibration(path, camera.calibration)
-            if images:
-                image = images[number]
-                name = f"{frame_id}{image.suffix}"
-                link_file(image, self._folder / "images" / camera.name / name)
-        if not copied.cameras and copied.calibration.has_camera:
-            write_calibration(self._folder / "calib" / f"{frame_id}.txt", copied.calibration)
+        for path, calibration in self._calibrations(copied, frame_id).items():
+            write_calibration(path, calibration)
+        for camera, image in zip(copied.cameras, images, strict=False):  # there may be no images
+            link_file(image, self._image(image, camera, frame_id))
         self._write_points(self._points(self._folder / "points", frame_id), frame)
+
+    def _calibrations(self, frame: Frame, frame_id: str) -> dict[Path, Calibration]:
+        """Return the calibrations of a frame by their paths in a copy."""
+        home, name = self._folder / "calib", f"{frame_id}.txt"
+        if not frame.cameras and frame.calibration.has_camera:
+            return {home / name: frame.calibration}
+        return {home / each.name / name: each.calibration for each in frame.cameras}
+
+    def _image(self, image: Path, camera: Camera, frame_id: str) -> Path:
+        """Return the path of a copy's image."""
+        return self._folder / "images" / camera.name / f"{frame_id}{image.suffix}"
+
+    @cached_property
+    def _first(self) -> Frame:
+        """The first frame that can be read, without points: its cameras are those of all frames.
+
+        Raises:
+            DataError: if no frame can be read.
+        """
+        for frame_id in self.frame_ids[:-1]:
+            with contextlib.suppress(DataError):
+                return self._dataset.read(frame_id, points=False)
+        return self._dataset.read(self.frame_ids[-1], points=False)
 
     def _description(self) -> str:
         """Return the content of dataset.toml, from the first frame."""
@@ -267,7 +309,7 @@ class FolderCopies(_Copies):
                 "intensity_scale": self._layout.intensity_scale,
             }
             lines += [f"{key} = {toml(value)}" for key, value in layout.items() if value]
-        first = self._dataset.read(self.frame_ids[0], points=False)
+        first = self._first
         has_images = bool(self._dataset.files(first.frame_id).images)
         if not first.cameras and first.calibration.has_camera:
             lines.append('calibration = "calib"')

@@ -149,7 +149,13 @@ def describe_headings(view: int, frames: Sequence[CopiedFrame]) -> str:
 
 
 def describe_few_matches(view: int, frames: Sequence[CopiedFrame]) -> str:
-    """Return a warning if hardly a box of a view matches; "" otherwise."""
+    """Return a warning if a view has no boxes, or hardly one matches; "" otherwise."""
+    total = sum(len(frame.plain) for frame in frames)
+    if total >= _LEAST_MATCHES and not any(len(frame.copy) for frame in frames):
+        return (
+            f"no boxes in {len(frames)} copies, but {total} in their frames; does the detector "
+            "read the copies?"
+        )
     own = _matches(frames, [frame.similarities[view] for frame in frames])
     possible = sum(min(len(frame.plain), len(frame.copy)) for frame in frames)
     if possible < _LEAST_MATCHES or own >= _FEW * possible:

@@ -5,7 +5,7 @@ import io
 import json
 import logging
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,26 @@ def fingerprint(
     labels: Path,
     settings: TrainingSettings,
     start: Path | None,
+    options: Mapping[str, Any],
 ) -> str:
-    """Return the SHA-256, in hexadecimal, of everything that a training's result depends on."""
+    """Return the SHA-256, in hexadecimal, of everything that a training's result depends on.
+
+    Args:
+        detector: class of the detector.
+        labels: the label file.
+        settings: the settings.
+        start: checkpoint to start from.
+        options: the options that the start checkpoint is loaded with; the content of files counts.
+    """
     relevant = {key: value for key, value in asdict(settings).items() if key not in _WITHOUT_EFFECT}
     trained = [detector.__module__, detector.__qualname__, detector.checkpoint_version]
     digest = hashlib.sha256(json.dumps([trained, relevant, torch.__version__]).encode())
     for path in (labels, start):
         digest.update(path.read_bytes() if path else b"from scratch")
+    for name, value in sorted(options.items()):
+        digest.update(f"{name}={value}".encode())
+        if isinstance(value, str | Path) and Path(value).is_file():
+            digest.update(Path(value).read_bytes())
     return digest.hexdigest()
 
 

@@ -90,9 +90,10 @@ def train(
     settings = replace(settings, preset=choose_preset(detector, settings.preset))
     samples = WeightedLabels(labels, read=read)
     processes = _useful_processes(settings, samples)
-    student = _first_student(detector, settings, samples.categories, start, options or {})
+    options = _options_of_start(detector, start, options or {})
+    student = _first_student(detector, settings, samples.categories, start, options)
     check_device(settings.device)
-    mark = fingerprint(detector, labels, settings, start)
+    mark = fingerprint(detector, labels, settings, start, options)
     writer = _Writer(labels, output, settings.steps, progress)
     while True:
         snapshot = find_snapshot(output, mark)
@@ -181,6 +182,16 @@ def _useful_processes(settings: TrainingSettings, samples: WeightedLabels) -> in
     return min(settings.processes, frames)
 
 
+def _options_of_start(
+    detector: type[TrainableDetector], start: Path | None, options: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """Return the options that the start checkpoint is loaded with; without one there are none."""
+    if start is None:
+        return {}
+    accepted = inspect.signature(detector.load_student).parameters
+    return {name: value for name, value in options.items() if name in accepted}
+
+
 def _first_student(
     detector: type[TrainableDetector],
     settings: TrainingSettings,
@@ -194,8 +205,7 @@ def _first_student(
             torch.manual_seed(settings.seed)
             student = detector.new_student(settings.preset or "", categories)
     else:
-        accepted = inspect.signature(detector.load_student).parameters.keys() & options.keys()
-        student = detector.load_student(start, **{name: options[name] for name in accepted})
+        student = detector.load_student(start, **options)
     expected = (*Student.__annotations__, *(name for name in vars(Student) if name[0] != "_"))
     missing = [name for name in expected if not hasattr(student, name)]
     if missing:

@@ -211,7 +211,8 @@ def _audited_splits(
 ) -> Iterator[tuple[Plan, str, ReportCallback]]:
     """Yield the plan and the split to audit, and the callback for the reports of its stages."""
     if not request.folds:
-        yield open_plan(workspace, request.round_number), request.split, record
+        plan = open_plan(workspace, request.round_number, split=request.split)
+        yield plan, request.split, record
         return
     for number, fold in enumerate(open_folds(workspace, request.folds), start=1):
         suffix = f" {number}/{request.folds}"
@@ -221,7 +222,7 @@ def _audited_splits(
 
         for first in graph_of(fold).first_stages:
             done(run_first(fold, first, progress))
-        yield open_plan(fold, 1), "val", done
+        yield open_plan(fold, 1, split="val"), "val", done
 
 
 def _run_stages(plan: Plan, split: str, progress: Progress, done: ReportCallback) -> set[str]:

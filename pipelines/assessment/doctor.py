@@ -17,7 +17,6 @@ from curate.evaluation.heading_examination import examine_headings
 from curate.evaluation.label_examination import examine_labels
 from curate.frames import Frame
 from curate.geometry.augmented_views import augmented_frame
-from curate.geometry.similarity import Similarity
 from curate.segmenters.base import Segmenter, image_size_of
 from pipelines.assembly import (
     Place,
@@ -32,14 +31,18 @@ from pipelines.category_names import detector_differences, find_differences
 from pipelines.devices import detector_place, idle_gpu, segmenter_place
 from pipelines.engine.rounds import choose_round, newest_checkpoint
 from pipelines.labels.of_one_frame import find_frame
+from pipelines.stages.labeled_copies import (
+    TURNED,
+    examine_labeled_copies,
+    labeled_frames,
+)
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
+from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
 
-# A of the copy on which a detector that runs elsewhere is tried.
-_TURNED = Similarity(flip_y=True, rotation_rad=0.4, scale=1.03)
 # Labeled frames whose labels are checked together.
 _LABELED_FRAMES = 5
 # Frames with recorded results that are checked together with the frame.
@@ -66,7 +69,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
         frame = workspace.dataset.read(name, image=semantic)
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
-    findings = [*_guarded("devices", lambda: _devices(workspace.config, semantic=semantic))]
+    findings = [*_guarded("devices", lambda: _devices(workspace, semantic=semantic))]
     findings += [*_names(find_differences(workspace)), *examine_frame(frame)]
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
@@ -97,9 +100,10 @@ def report_wrong_inputs(workspace: Workspace) -> None:
             _log.warning("%s: %s; see `curate doctor`", finding.check, finding.message)
 
 
-def _devices(config: Config, *, semantic: bool) -> Sequence[Finding]:
+def _devices(workspace: Workspace, *, semantic: bool) -> Sequence[Finding]:
     """Report where the models run."""
-    check_detector(config)
+    config = workspace.config
+    check_detector(config, workspace.root)
     if semantic:
         check_segmenter(config)
     places = {"detector": detector_place(config)}
@@ -135,7 +139,8 @@ def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
 def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     config = workspace.config
     number, _ = choose_round(workspace, None, None)
-    place = Place(workspace.root, number, copies=True)
+    split = next(each for each in SPLITS if frame.frame_id in workspace.frames(each))
+    place = Place(workspace.root, number, copies=split)
     detector = open_detector(config, newest_checkpoint(workspace), place)
     missing = describe_missing_results(workspace, detector)
     seen = visible(frame, config)
@@ -152,13 +157,17 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     if isinstance(detector, RecordedDetector) and detector.lacks_copy(frame.frame_id):
         findings.append(Finding("views", "ok", "the augmented copies are those of another split"))
     elif isinstance(detector, CopiesDetector):
-        findings += _copy(detector, seen, found, config)
+        findings += _copies(workspace, detector, seen, found)
     elif isinstance(detector, RecordedViews):
         views = detector.views(frame.frame_id)
+        empty = len(found) > 0 and not any(len(detections) for _, detections in views)
+        recorded = f"{len(views)} recorded augmented copies of this frame"
         findings.append(
-            Finding("views", "ok", f"{len(views)} recorded augmented copies of this frame")
-            if views
-            else _no_views(config)
+            _no_views(config)
+            if not views
+            else Finding("views", "suspect", f"{recorded}, but no box in any of them")
+            if empty
+            else Finding("views", "ok", recorded)
         )
         for similarity, detections in views:
             augmented = augmented_frame(seen, similarity)
@@ -170,11 +179,15 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     return findings
 
 
-def _copy(
-    detector: CopiesDetector, frame: Frame, found: Detections, config: Config
+def _copies(
+    workspace: Workspace, detector: CopiesDetector, frame: Frame, found: Detections
 ) -> list[Finding]:
-    """Run a detector that runs elsewhere on a turned copy of the frame, and check its boxes."""
-    [copy] = detector.predict_copies({frame.frame_id: _TURNED}, view=1)
+    """Run a detector that runs elsewhere on turned copies of the frame and of labeled frames."""
+    config = workspace.config
+    labeled = [name for name in labeled_frames(workspace) if name != frame.frame_id]
+    [copy, *others] = detector.predict_copies(
+        dict.fromkeys([frame.frame_id, *labeled], TURNED), view=1
+    )
     if isinstance(copy, CurateError):
         return [Finding("views", "wrong", str(copy))]
     copy = renamed(copy, config.detector.rename)
@@ -186,10 +199,22 @@ def _copy(
         return [Finding("views", "wrong", message)]
     wrong = [
         finding
-        for finding in examine_detections(augmented_frame(frame, _TURNED), copy, ())
+        for finding in examine_detections(augmented_frame(frame, TURNED), copy, ())
         if finding.check == "boxes" and finding.state == "wrong"
     ]
-    return wrong or [Finding("views", "ok", f"{len(copy)} boxes in a turned copy of this frame")]
+    state = "ok" if len(copy) or not len(found) else "suspect"
+    message = f"{len(copy)} boxes in a turned copy of this frame, {len(found)} in the frame"
+    views = wrong or [Finding("views", state, message)]
+    usable = {
+        name: checked(each, config)
+        for name, each in zip(labeled, others, strict=True)
+        if not isinstance(each, CurateError)
+    }
+    problem, findings = examine_labeled_copies(config, workspace.dataset, detector, usable)
+    if problem:
+        return [*views, Finding("headings", "wrong", problem)]
+    few = f"not compared: the command finds too few objects of {len(usable)} labeled frames"
+    return [*views, *(findings or [Finding("headings", "ok", few)])]
 
 
 def _other_results(

@@ -24,7 +24,8 @@ def augment(
         Path,
         typer.Argument(
             metavar="OUT",
-            help="Folder to write to; {round} stands for the number of the round.",
+            help="Folder to write to; {round} stands for the number of the round, {split} for the "
+            "split.",
         ),
     ],
     split: SplitOption = "unlabeled",

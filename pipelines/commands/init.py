@@ -137,7 +137,7 @@ def init(
     for setting in settings or ():
         change_setting(document, setting)
     config = make_config(document, "curate init")
-    check_extensions(config)
+    check_extensions(config, directory.resolve())
     check_files(config)
     supplied = check_before_init(config)
     chosen = any(setting.partition("=")[0].strip() == "run.priors" for setting in settings or ())

@@ -43,7 +43,12 @@ def run_frame_command(
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import open_round, outside_rounds, preview_round
-    from pipelines.engine.runner import check_inputs, open_executor, run_frames
+    from pipelines.engine.runner import (
+        check_earlier_stages,
+        check_inputs,
+        open_executor,
+        run_frames,
+    )
     from pipelines.round import graph_of
     from pipelines.workspace.splits import SPLITS
 
@@ -65,7 +70,10 @@ def run_frame_command(
     if dry_run:
         outside = outside_rounds(workspace)
         context = outside if round_number == 0 else preview_round(workspace, round_number)
-        check_inputs(Plan(workspace, context, graph), selected, split)
+        context = replace(context, split=split)
+        plan = Plan(workspace, context, graph)
+        check_inputs(plan, selected, split)
+        check_earlier_stages(plan, selected, split)
         preview = Preview(workspace, graph, context.number, context)
         planned = (preview.frames_stage(stage, split, alone=True) for stage in selected)
         print_preview(planned, as_json=as_json)
@@ -73,8 +81,10 @@ def run_frame_command(
     if round_number == 0:
         plan = Plan(workspace, outside_rounds(workspace), graph)
     else:
-        plan = Plan(workspace, open_round(workspace, round_number), graph)
+        context = replace(open_round(workspace, round_number), split=split)
+        plan = Plan(workspace, context, graph)
     check_inputs(plan, selected, split)
+    check_earlier_stages(plan, selected, split)
     reports = []
     with open_executor(workspace) as work:
         for stage in selected:

@@ -51,11 +51,11 @@ def train_round(
 
     After an interruption the same command resumes from the last snapshot.
 
-    --command runs your own trainer instead. {labels}, {output}, {teacher}, {round} and {policy} in
-    it are replaced, and are in its environment as CURATE_LABELS, CURATE_OUTPUT and so on. No shell
-    is involved. The trainer writes the file or folder {output}. After a student of the configured
-    policy, the command is stored in curate.toml and also trains later rounds. docs/training.md
-    shows how a trainer uses the weights.
+    --command runs your own trainer instead, in the folder of the workspace and without a shell.
+    {labels}, {output}, {teacher}, {round} and {policy} in it are replaced, and are in its
+    environment as CURATE_LABELS, CURATE_OUTPUT and so on. The trainer writes the file or folder
+    {output}. After a student of the configured policy, the command is stored in curate.toml and
+    also trains later rounds. docs/training.md shows how a trainer uses the weights.
 
     Example: curate train-round --command "python train.py {labels} {output}"
     """

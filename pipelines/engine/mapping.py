@@ -47,7 +47,7 @@ def map_frames(
     for next_frame in frames:
         batches = batches_for(function, chain([next_frame], frames))
         outcomes = executor.map(function, Counted(batches, total - len(first_frames)))
-        yield from _until_all_fail(outcomes, FAILED_BATCHES * function.batch_size)
+        yield from _until_all_fail(outcomes)
 
 
 class Counted(Iterator[Job]):
@@ -76,17 +76,26 @@ class Counted(Iterator[Job]):
         return round(left * self._jobs_taken / self._frames_taken) if self._frames_taken else left
 
 
-def _until_all_fail(outcomes: Iterator[Outcome], limit: int) -> Iterator[Outcome]:
+def _until_all_fail(outcomes: Iterator[Outcome]) -> Iterator[Outcome]:
     """Yield outcomes.
 
     Raises:
-        ModelError: if so many frames in a row have failed.
+        ModelError: if all frames of `FAILED_BATCHES` batches in a row have failed; the last batch
+            of a run may be a small one.
     """
-    failed = 0
+    failed = batches = 0  # in a row
+    whole = True  # whether all frames of the batch so far have failed
     for outcome in outcomes:
         yield outcome
-        failed = failed + 1 if outcome.error is not None else 0
-        if failed == limit:
+        if outcome.error is None:
+            failed = batches = 0
+            whole = False
+        else:
+            failed += 1
+        if outcome.ends_job:
+            batches += whole
+            whole = True
+        if batches == FAILED_BATCHES:
             raise ModelError(
                 f"{failed} frames in a row failed, so the rest is left out; finished frames are "
                 f"kept; the last error: {outcome.error}"

@@ -15,6 +15,7 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
+from curate.errors import WorkspaceError
 from curate.files.batches import batched
 from db import bulk
 from db.claims import Resource, round_resources
@@ -107,6 +108,29 @@ def check_inputs(plan: Plan, stages: Iterable[Stage], split: str = "unlabeled") 
             counts = plan.counts(stage, split)
             if counts.waiting or counts.failed:
                 stage.ready(plan.workspace, plan.context, split)
+
+
+def check_earlier_stages(plan: Plan, stages: Sequence[FramesStage], split: str) -> None:
+    """Check that stages that run alone have frames to work on; warn of those that must wait.
+
+    Raises:
+        WorkspaceError: if an earlier stage has not processed any of the frames that are left.
+    """
+    names = {stage.name for stage in stages}
+    for stage in stages:
+        for other in plan.graph.before(stage):
+            waiting = 0 if other.name in names else plan.counts(other, split).waiting
+            if not waiting:
+                continue
+            options = "" if split == "unlabeled" else f" --split {split}"
+            message = (
+                f"{stage.name}: {other.name} of {waiting} {split} frames in round "
+                f"{plan.context.number} is missing or out of date; run `curate {other.command}"
+                f"{options}` first, or `curate run` for all stages"
+            )
+            if not plan.count_waiting(stage, split):
+                raise WorkspaceError(message)
+            _log.warning("%s", message)
 
 
 def run_frames(

@@ -39,12 +39,14 @@ class RoundContext:
         rounds: number E of rounds.
         seed: seed of the workspace.
         teacher: the detector that predicts.
+        split: split of the frames on which the stages of frames work.
     """
 
     number: int
     rounds: int
     seed: int
     teacher: Teacher
+    split: str = "unlabeled"
 
     @property
     def age(self) -> Age:

@@ -15,7 +15,7 @@ from curate.datasets.base import Dataset
 from curate.datasets.copies import CopyWriter, copy_writer
 from curate.datasets.manifest import Manifest, view_folder
 from curate.errors import ConfigError, CurateError, DataError, error_prefix
-from pipelines.assembly import fill_round
+from pipelines.assembly import fill_folder
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.progress import Progress
 from pipelines.engine.runner import open_executor
@@ -148,12 +148,14 @@ def plan(
     """Return what is to be written; nothing is written.
 
     Raises:
-        ConfigError: if the split has no frames.
+        ConfigError: if the split has no frames, or the folder is in the data set or cannot be
+            created.
         DataError: if the folder contains something else, or the disk is too small.
     """
     if not workspace.frames(split):
         raise ConfigError(f"--split {split}: the workspace has no {split} frames")
-    folder = fill_round(folder, round_number)
+    folder = fill_folder(folder, round_number, split)
+    _check_place(workspace, folder)
     manifest = manifest_of(workspace, round_number, split, camera_view=camera_view)
     manifest.check_place(folder)
     frames = shard.of(list(manifest.frames))
@@ -164,8 +166,7 @@ def plan(
         if count:
             missing.append(frame)
             size += count * (_FILES_BYTES + _size(workspace.dataset.files(frame).points))
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    free = shutil.disk_usage(existing).free
+    free = shutil.disk_usage(_existing(folder)).free
     if size > free:
         raise DataError(
             f"{folder}: the copies need about {_gigabytes(size)}, but the disk has only "
@@ -209,6 +210,28 @@ def write(workspace: Workspace, planned: PlannedCopies, progress: Progress) -> R
                 result.errors.append((outcome.job.title, outcome.error))
             advance(1, f"{len(result.errors)} failed" if result.errors else "")
     return result
+
+
+def _check_place(workspace: Workspace, folder: Path) -> None:
+    """Raise ConfigError if a folder is in the data set, or cannot be created."""
+    path, data = folder.resolve(), workspace.config.dataset.root.resolve()
+    # A workspace in the data set is the user's choice already.
+    workspaces = [workspace.root] if workspace.root.is_relative_to(data) else []
+    if path.is_relative_to(data) and not any(map(path.is_relative_to, workspaces)):
+        raise ConfigError(
+            f"{folder}: is in the data set {data}, whose readers could take the copies for frames; "
+            "choose a folder outside"
+        )
+    existing = _existing(folder)
+    if not existing.is_dir():
+        raise ConfigError(f"{folder}: {existing} is not a folder; choose another place")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise ConfigError(f"{folder}: {existing} cannot be written to; choose another place")
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder, or the nearest path above it that exists."""
+    return next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
 
 
 def _size(path: Path) -> int:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
+_SEVERAL = ", and set detector.augmented; {split} in it names the copies of each split"
 # Frames with results that are compared with those of their copies.
 _COMPARED = 64
 
@@ -83,16 +84,24 @@ def check_copies(workspace: Workspace, context: RoundContext, split: str) -> Non
     """
     from curate.detectors.recorded import RecordedDetector
 
-    folder = copies_folder(workspace.config, context.number)
+    folder = copies_folder(workspace.config, context.number, split)
     frames = list(workspace.frames(split))
     if folder is None or not frames:
         return
     expected = manifest_of(workspace, context.number, split)
+    command = f"curate augment FOLDER --round {context.number} --split {split}"
+    if not (folder / NAME).exists():
+        raise DataError(
+            f"{folder / NAME}: no such file; write the copies with `{command}`, or correct "
+            "detector.augmented"
+        )
     difference = Manifest.read(folder).difference(expected)
     if difference:
-        command = f"curate augment FOLDER --round {context.number} --split {split}"
-        raise DataError(f"{folder / NAME}: {difference}; write the copies with `{command}`")
-    place = Place(workspace.root, context.number, copies=True)
+        several = "" if "{split}" in str(workspace.config.detector.augmented) else _SEVERAL
+        raise DataError(
+            f"{folder / NAME}: {difference}; write the copies with `{command}`{several}"
+        )
+    place = Place(workspace.root, context.number, copies=split)
     detector = open_detector(workspace.config, context.teacher.path, place)
     if not isinstance(detector, RecordedDetector):
         return

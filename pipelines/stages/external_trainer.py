@@ -9,24 +9,14 @@ import sys
 from pathlib import Path
 
 from curate.errors import TrainerFailed
-from curate.files.user_command import UserCommand, describe_end
+from curate.files.user_command import describe_end
+from pipelines.assembly import trainer_command
 from pipelines.engine.stage import RoundJob
 from pipelines.registry import EXPORTERS
 from pipelines.stages import export
 from pipelines.workspace.workspace import Workspace
 
 _STANDARD_ERROR = 2
-
-
-def trainer_command(command: str) -> UserCommand:
-    """Return the configured command.
-
-    Raises:
-        ConfigError: if it cannot be parsed, or its program does not exist.
-    """
-    parsed = UserCommand.parse("train command", command)
-    parsed.check_program()
-    return parsed
 
 
 def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
@@ -48,11 +38,11 @@ def train_externally(workspace: Workspace, job: RoundJob, output: Path) -> None:
         "round": str(job.context.number),
         "policy": job.policy,
     }
-    command = trainer_command(workspace.config.train.command or "")
+    command = trainer_command(workspace.config.train.command or "", workspace.root)
     draft.parent.mkdir(parents=True, exist_ok=True)
     before = _state(draft)
     sys.stderr.flush()
-    if code := command.run(values, _STANDARD_ERROR):
+    if code := command.run(values, _STANDARD_ERROR, folder=workspace.root):
         raise TrainerFailed(
             f"the trainer {command.short} ended with {describe_end(code)}; see its output above, "
             "fix the cause and rerun the command"

@@ -34,6 +34,11 @@ from pipelines.category_names import check_detector_names
 from pipelines.devices import detector_place
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
+from pipelines.stages.labeled_copies import (
+    TURNED,
+    examine_labeled_copies,
+    labeled_frames,
+)
 from pipelines.stages.reading import FrameReader
 from pipelines.workspace.config import Config, DetectorSection, SegmenterSection
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256
@@ -64,11 +69,13 @@ class Predict:
         config: the configuration.
         teacher: checkpoint of the teacher; None for a command without one.
         place: workspace and round.
+        labeled: labeled frames, on which a command shows how its headings are meant.
     """
 
     config: Config
     teacher: Path | None
     place: Place
+    labeled: Sequence[str] = ()
 
     def open(self) -> None:
         """Open the data set and load the detector."""
@@ -96,14 +103,44 @@ class Predict:
         return TRIAL_FRAMES if runs_elsewhere(self.config) else 0
 
     def trial(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
-        """Return the rows of the first frames.
+        """Return the rows of the first frames; the same run has turned copies of labeled frames.
 
         Raises:
-            CurateError: if the detector is wrong, or all frames fail.
+            CurateError: if the detector is wrong, all frames fail, or its headings do not fit the
+                labels.
         """
-        rows = self.batch(jobs)
+        if not isinstance(self.detector, CopiesDetector):
+            return self.batch(jobs)
+        names = [job.frame for job in jobs]
+        labeled = [name for name in self.labeled if name not in names]
+        found = self.detector.predict_copies(
+            {**dict.fromkeys(names), **dict.fromkeys(labeled, TURNED)}
+        )
+        rows = for_each(self._rows, found[: len(names)])
         raise_errors_of_detector(rows)
+        self._check_headings(self.detector, dict(zip(labeled, found[len(names) :], strict=True)))
         return rows
+
+    def _check_headings(
+        self, detector: CopiesDetector, copies: Mapping[str, Detections | CurateError]
+    ) -> None:
+        """Compare the results of turned labeled frames with the labels.
+
+        Raises:
+            ModelError: if they do not fit.
+        """
+        found = {
+            name: self.checked(each)
+            for name, each in copies.items()
+            if not isinstance(each, CurateError)
+        }
+        place = "detector.options.command, turned copies of labeled frames"
+        problem, findings = examine_labeled_copies(self.config, self.dataset, detector, found)
+        if problem:
+            raise ModelError(f"{place}: {problem}")
+        for finding in findings:
+            if finding.state != "ok":
+                warn_once(f"{place}: {finding.message}")
 
     def batch(self, jobs: Sequence[FrameJob]) -> list[FrameRows | CurateError]:
         """Return the rows of `prediction` of each frame."""
@@ -329,7 +366,7 @@ def check(workspace: Workspace) -> None:
         ConfigError: if it cannot.
     """
     config = workspace.config
-    check_detector(config)
+    check_detector(config, workspace.root)
     option_files(workspace)
     command = config.detector.options.get("command", "")
     ignores_students = "{" in command and "{teacher}" not in command
@@ -342,4 +379,6 @@ def check(workspace: Workspace) -> None:
 
 def function(workspace: Workspace, context: RoundContext) -> Predict:
     """Return what predict does with a frame."""
-    return Predict(workspace.config, context.teacher.path, Place(workspace.root, context.number))
+    place = Place(workspace.root, context.number)
+    labeled = labeled_frames(workspace) if runs_elsewhere(workspace.config) else ()
+    return Predict(workspace.config, context.teacher.path, place, labeled)

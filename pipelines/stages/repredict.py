@@ -16,14 +16,13 @@ from curate.evaluation.copy_examination import (
     examine_view,
 )
 from curate.frames import RotationY
-from curate.geometry.augmented_views import augmented_calibration
-from curate.geometry.mounting import rotations_y_of_yaws, yaws_of_rotations_y
 from curate.geometry.similarity import Similarity
 from curate.warnings_once import warn_once
 from pipelines.assembly import Place, consistency_settings, copies_folder, runs_elsewhere
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext, Settings
 from pipelines.stages.copies import augmented_views, copies_fingerprint
+from pipelines.stages.labeled_copies import read_as
 from pipelines.stages.predict import (
     Predict,
     detection_columns,
@@ -39,7 +38,7 @@ class Repredict(Predict):
     """Predicts augmented copies of frames, and compares them with the frames' predictions."""
 
     def __init__(self, predict: Predict, seed: int) -> None:
-        super().__init__(predict.config, predict.teacher, replace(predict.place, copies=True))
+        super().__init__(predict.config, predict.teacher, predict.place)
         self.seed = seed
 
     @property
@@ -117,7 +116,8 @@ class Repredict(Predict):
                     continue
                 copy = self.checked(copy)
                 if meaning is not None:
-                    copy = self._read_as(meaning, detector, job.frame, similarity, copy)
+                    calibration = self.dataset.read(job.frame, points=False).calibration
+                    copy = read_as(meaning, detector, calibration, similarity, copy)
                 frames.append(CopiedFrame(job.predictions, copy, [a for a, _ in found]))
             return frames
 
@@ -127,24 +127,6 @@ class Repredict(Predict):
             raise ModelError(f"detector.options.command, view {view + 1}: {problem}")
         if remark:
             warn_once(f"detector.options.command, view {view + 1}: {remark}")
-
-    def _read_as(
-        self,
-        meaning: RotationY,
-        detector: CopiesDetector,
-        frame_id: str,
-        similarity: Similarity,
-        found: Detections,
-    ) -> Detections:
-        """Return the detections of a copy with rotation_y of their file in another meaning."""
-        calibration = self.dataset.read(frame_id, points=False).calibration
-        copied = augmented_calibration(calibration, similarity)
-        boxes = found.boxes.copy()
-        rotations_y = rotations_y_of_yaws(
-            boxes[:, 6], copied, detector.rotation_y_of_copies(calibration)
-        )
-        boxes[:, 6] = yaws_of_rotations_y(rotations_y, copied, meaning)
-        return replace(found, boxes=boxes)
 
     def _compared(self, job: FrameJob, found: Sequence[View]) -> FrameRows:
         """Return the rows of a frame."""
@@ -179,14 +161,14 @@ class Repredict(Predict):
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
     """Return what repredictions depend on besides predictions and teacher."""
     section = workspace.config.repredict.model_dump(mode="json")
-    folder = copies_folder(workspace.config, context.number)
+    folder = copies_folder(workspace.config, context.number, context.split)
     copies = {} if folder is None else {"copies": copies_fingerprint(folder)}
     return {**section, **copies, "seed": context.seed, "round": context.number}
 
 
 def function(workspace: Workspace, context: RoundContext) -> Repredict:
     """Return what repredict does with a frame."""
-    place = Place(workspace.root, context.number)
+    place = Place(workspace.root, context.number, copies=context.split)
     return Repredict(Predict(workspace.config, context.teacher.path, place), context.seed)
 
 

@@ -20,13 +20,14 @@ from pipelines.assembly import (
     check_policy,
     trainable_detector,
     trained_detector,
+    trainer_command,
 )
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
 from pipelines.engine.progress import Progress, as_total
 from pipelines.engine.rounds import register_checkpoint
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
-from pipelines.stages.external_trainer import train_externally, trainer_command
+from pipelines.stages.external_trainer import train_externally
 from pipelines.stages.methods import Method, method_of, zero_weight_of
 from pipelines.stages.vanished import check_labels
 from pipelines.workspace.config import Config, TrainSection
@@ -111,7 +112,7 @@ def check(workspace: Workspace, policy: str) -> None:
     check_policy(config, policy)
     if config.train.command is not None:
         check_labels_format(config, workspace.dataset)
-        trainer_command(config.train.command)
+        trainer_command(config.train.command, workspace.root)
     elif trainable_detector(config):
         section, method = config.train, method_of(config, policy)
         training_settings(workspace, section.round_steps, section.round_learning_rate, 1, method)

@@ -210,9 +210,9 @@ class DetectorSection(Section):
     augmented: Path | None = Field(
         default=None,
         description="Folder of `curate augment` with the results of the copies, for recorded "
-        "results. {round} stands for the number of the round; a relative path starts at the "
-        "workspace.",
-        examples=["copies/round-{round}"],
+        "results. {round} and {split} stand for the number of the round and the split of the "
+        "frames; a relative path starts at the workspace.",
+        examples=["copies/{round}-{split}"],
     )
     device: Annotated[str, KnownDevice()] = Field(
         default="auto",
@@ -532,7 +532,8 @@ class TrainSection(Section):
     )
     command: str | None = Field(
         default=None,
-        description="Command of your own trainer; see docs/training.md.",
+        description="Command of your own trainer, which runs in the folder of the workspace; see "
+        "docs/training.md.",
         examples=["python train.py {labels} {output}"],
     )
     labels_format: ExporterName = Field(

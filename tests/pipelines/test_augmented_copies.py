@@ -283,6 +283,28 @@ def test_headings_in_another_convention_are_found(
     assert code == 0, err
 
 
+def test_messages_name_the_results_of_the_view_that_is_wrong(
+    curate: Curate, work: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Frame names, category names, and results without any box; those of the frames are right."""
+    results = augment_and_detect(curate, work, tmp_path) / "view-1/results"
+    right = {path.name: path.read_text() for path in results.iterdir()}
+    for path in results.iterdir():
+        path.rename(results / f"x{path.name}")
+    code, _, err = curate("run", "-w", work)
+    assert (code, f"{results}: results for frames that do not exist (x0" in err) == (3, True)
+    for path in results.iterdir():
+        path.unlink()
+    for name, text in right.items():
+        (results / name).write_text(text.replace("Pedestrian", "pedestrian"))
+    code, _, err = curate("run", "-w", work)
+    assert (code, f"the results {results} have pedestrian, but" in err) == (2, True)
+    for name in right:
+        (results / name).write_text("")
+    assert curate("repredict", "-w", work)[0] == 0
+    assert f"{results}: no boxes in 16 copies, but 48 in their frames" in caplog.text
+
+
 def test_missing_results_are_counted_at_the_start(
     curate: Curate, work: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -363,6 +385,49 @@ def test_other_splits(curate: Curate, work: Path, split: str) -> None:
         return
     assert "4 frames written" in out
     assert not list((work / "copies").rglob("label_2"))
+
+
+def test_every_split_has_copies_of_its_own(curate: Curate, work: Path, tmp_path: Path) -> None:
+    """{split} in the command and in the setting: results of one split leave those of another."""
+    for split in ("unlabeled", "labeled"):
+        code, out, err = curate("augment", work / "{split}/{round}", "-w", work, "--split", split)
+        assert code == 0, err
+        assert out.endswith('augmented = "{split}/{round}"\n')
+        for view in (work / split / "1").glob("view-*"):
+            detect(RayDetector(empty(tmp_path)), view, view / "results")
+    set_augmented(work, "{split}/{round}")
+    for split in ("unlabeled", "labeled"):
+        for command in ("predict", "repredict"):
+            code, _, err = curate(command, "--split", split, "-w", work)
+            assert code == 0, err
+    for split in ("unlabeled", "labeled"):
+        out = curate("repredict", "--split", split, "--dry-run", "--json", "-w", work)[1]
+        assert [each["frames"] for each in json.loads(out)["stages"]] == [0]
+    name = query(curate, work, "SELECT frame FROM frame WHERE split = 'labeled'")[0]["frame"]
+    code, out, _ = curate("doctor", name, "-w", work)
+    assert "2 recorded augmented copies of this frame" in out
+    set_augmented(work, "{splits}")
+    for command in (["run"], ["doctor"]):
+        out = "".join(map(str, curate(*command, "-w", work)))
+        assert "{splits}: unknown placeholder {splits}; did you mean 'split'?" in out
+
+
+def test_a_folder_in_which_copies_cannot_be_is_found_at_the_start(
+    curate: Curate, work: Path, data: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for folder, message in {
+        data / "training/copies": f"is in the data set {data}",
+        tmp_path / "{policy}": "unknown placeholder {policy}; it has {round} and {split}",
+        tmp_path / "file/copies/1": f"{tmp_path}/file is not a folder",
+        tmp_path / "link": f"{tmp_path}/link is not a folder",
+    }.items():
+        for more in ([], ["--dry-run"]):
+            code, _, err = curate("augment", folder, "-w", work, *more)
+            assert (code, err.count("\n")) == (2, 1)
+            assert message in err
+    assert not (data / "training/copies").exists()
 
 
 def test_what_would_be_written(curate: Curate, work: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ other names. Tr takes the place of rectification and LiDAR to camera. Two names 
 may both be present if their entries are equal.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -190,6 +191,10 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     Tr_velo_to_cam is the complete transform from the LiDAR to the rectified camera, and R0_rect is
     the identity. P0, P1 and P3 repeat P2, for readers that expect P2 on the third line.
     """
+    replace_file(path, _text(calibration).encode())
+
+
+def _text(calibration: Calibration) -> str:
     matrices = dict.fromkeys(("P0", "P1", "P2", "P3"), calibration.projection)
     matrices["R0_rect"] = np.eye(3)
     matrices["Tr_velo_to_cam"] = calibration.lidar_to_camera[:3]
@@ -198,7 +203,21 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         f"{key}: {' '.join(f'{entry:.16e}' for entry in matrix.ravel())}\n"
         for key, matrix in matrices.items()
     ]
-    replace_file(path, "".join(lines).encode())
+    return "".join(lines)
+
+
+# Numbers without a sign are the shortest; a missing line is longer than all signs.
+_SHORTEST = len(_text(Calibration(np.zeros((3, 4)), np.zeros((4, 4)))))
+
+
+def is_written_calibration(path: Path) -> bool:
+    """Return whether a file of `write_calibration` is complete, as far as its size and end show."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            return size >= _SHORTEST and file.seek(size - 1) >= 0 and file.read() == b"\n"
+    except OSError:
+        return False
 
 
 def _require(

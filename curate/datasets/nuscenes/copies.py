@@ -7,7 +7,7 @@ The tables of annotations are empty.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -28,7 +28,7 @@ from curate.datasets.nuscenes.tables import (
     text,
 )
 from curate.files.atomic import replace_file
-from curate.files.links import link_file
+from curate.files.links import is_linked, link_file
 from curate.frames import Calibration
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.poses import invert_pose
@@ -109,16 +109,16 @@ class NuScenesCopies:
             replace_file(home / f"{name}.json", f"[\n{rows}\n]".encode() if rows else b"[]")
 
     def is_written(self, frame_id: str) -> bool:
-        """Return whether the copy has a sweep, which is its last file."""
-        return (self._folder / self._sweep(frame_id)).exists()
+        """Return whether the copy has a sweep, which is its last file, and its images."""
+        return (self._folder / self._sweep(frame_id)).exists() and all(
+            is_linked(source, self._folder / name) for name, source in self._images(frame_id)
+        )
 
     def write(self, frame_id: str) -> None:
         """Link the images and write the sweep of a copy."""
         frame = self._dataset.read(frame_id)  # checks its files
-        for record in self._records[frame_id].values():
-            source = self._dataset.root / record["filename"]
-            if record["filename"] != self._sweep(frame_id) and source.exists():
-                link_file(source, self._folder / record["filename"])
+        for name, source in self._images(frame_id):
+            link_file(source, self._folder / name)
         source = self._dataset.files(frame_id).points
         target = self._folder / self._sweep(frame_id)
         similarity = self._copies[frame_id]
@@ -137,6 +137,13 @@ class NuScenesCopies:
             if self._camera_view
             else None,
         )
+
+    def _images(self, frame_id: str) -> Iterator[tuple[str, Path]]:
+        """Yield the path of each image of a frame within the data set, and the file."""
+        for record in self._records[frame_id].values():
+            source = self._dataset.root / record["filename"]
+            if record["filename"] != self._sweep(frame_id) and source.exists():
+                yield record["filename"], source
 
     def _sweep(self, frame_id: str) -> str:
         """Return the path of a frame's sweep within the data set."""

@@ -20,14 +20,15 @@ from typing import Any
 
 from curate.datasets.base import Dataset
 from curate.datasets.copies import copy_writer
+from curate.datasets.frame_names import FrameNames
 from curate.detections import Detections
 from curate.detectors.command.batch_folders import BatchFolders
 from curate.detectors.option_names import name_results_options, results_options_named
 from curate.detectors.recorded import RecordedDetector
-from curate.detectors.recorded.formats import check_kind
+from curate.detectors.recorded.formats import SUFFIXES, check_kind
 from curate.errors import ConfigError, CurateError, DataError, ModelError, one_line
 from curate.files.paths import StrPath
-from curate.files.user_command import UserCommand, describe_end, fill
+from curate.files.user_command import UserCommand, describe_end, describe_missing, fill
 from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotation_y_of_tools
@@ -58,16 +59,18 @@ class CommandDetector:
         results: how the results are read: the options of `RecordedDetector`, such as kind, classes
             and rotation_y, and `path` within {results} (a name or a pattern). Placeholders are
             replaced here too.
-        files: files that the predictions depend on, such as the configuration of the model. A
-            change of their content makes predictions outdated; the detector does not read them.
+        files: files that the predictions depend on, such as the configuration of the model,
+            relative to `folder`. A change of their content makes predictions outdated; the detector
+            does not read them.
         camera_view: whether the copies have only the points that a camera sees.
         timeout_s: seconds after which the command is ended.
         open_dataset: opens the data set.
-        folder: folder in which `batches` and `logs` are created.
+        folder: folder in which the command runs and `batches` and `logs` are created.
         round_number: number of the round, for {round}.
 
     Raises:
-        ConfigError: if the command or an option is invalid, or the program does not exist.
+        ConfigError: if the command or an option is invalid, or the program or a file does not
+            exist.
     """
 
     def __init__(
@@ -84,23 +87,29 @@ class CommandDetector:
         folder: StrPath = ".",
         round_number: int = 1,
     ) -> None:
+        self._folder = Path(folder).absolute()
         self._command = UserCommand.parse(_TITLE, command)
-        _check_command(self._command)
+        _check_placeholders(self._command)
         self._results = dict(results or {})
         _check_results(self._results)
         if isinstance(files, str):
             raise ConfigError(f'detector.options.files: write a list, ["{files}"]')
+        for name in files:
+            if not (self._folder / name).exists():
+                missing = describe_missing(name, self._folder)
+                raise ConfigError(f"detector.options.files: {missing}")
         self._path = "" if path is None else str(Path(path).absolute())
         if "teacher" in self._command.placeholders() and path is None:
             raise ConfigError(
                 f"{_TITLE}: uses {{teacher}}, but detector.path, the checkpoint of the first "
                 "round, is not set"
             )
+        self._command.check(self._folder)
         self._minimum_score = minimum_score
         self._camera_view = camera_view
         self._timeout_s = timeout_s
         self._open_dataset = open_dataset
-        self._folders = BatchFolders(Path(folder).absolute())
+        self._folders = BatchFolders(self._folder)
         self._round_number = round_number
 
     @classmethod
@@ -226,7 +235,7 @@ class CommandDetector:
         with log.open("wb") as output:
             output.write(f"$ {shlex.join(self._command.filled(values))}\n".encode())
             output.flush()
-            code = self._command.run(values, output, self._timeout_s)
+            code = self._command.run(values, output, self._timeout_s, self._folder)
         _shorten(log)
         if code == 0 and any(Path(values["results"]).iterdir()):
             return
@@ -256,7 +265,8 @@ class CommandDetector:
         for key, value in self._results.items():
             if isinstance(value, str):
                 options[key] = fill(value, values)
-        path = _result_path(Path(values["results"]), options.pop("path", None), copies)
+        path, kind = _find_results(Path(values["results"]), options.pop("path", None), copies)
+        options.setdefault("kind", kind)
         with results_options_named():
             return RecordedDetector(
                 path,
@@ -284,11 +294,11 @@ def _moved(found: Detections | CurateError, folder: Path, kept: Path) -> Detecti
     return type(found)(name_results_options(str(found).replace(str(folder), str(kept))))
 
 
-def _check_command(command: UserCommand) -> None:
-    """Check placeholders and program; a command without placeholders reads the environment.
+def _check_placeholders(command: UserCommand) -> None:
+    """Check the placeholders of a command; without any it reads the environment.
 
     Raises:
-        ConfigError: if a placeholder is unknown or missing, or the program does not exist.
+        ConfigError: if a placeholder is unknown or missing.
     """
     command.check_placeholders(PLACEHOLDERS)
     used = command.placeholders()
@@ -302,7 +312,6 @@ def _check_command(command: UserCommand) -> None:
             f"{_TITLE}: has neither {{data}} nor {{clouds}}, the frames that it must read; add one "
             "(or use no placeholders at all, and read $CURATE_DATA)"
         )
-    command.check_program()
 
 
 def _check_results(results: Mapping[str, Any]) -> None:
@@ -324,8 +333,13 @@ def _check_results(results: Mapping[str, Any]) -> None:
         )
 
 
-def _result_path(results: Path, pattern: str | None, frame_ids: Collection[str]) -> Path:
-    """Return the file or folder of the results: {results}, its only file, or what a pattern fits.
+def _find_results(
+    results: Path, pattern: str | None, frame_ids: Collection[str]
+) -> tuple[Path, str]:
+    """Return the file or folder of the results, and its kind if the names of the files show it.
+
+    The results are what a pattern fits, or the only file, or the files with names of frames, or
+    the only file that can hold the results of several frames: there may be logs beside it.
 
     Raises:
         ModelError: if nothing or several paths fit.
@@ -338,12 +352,26 @@ def _result_path(results: Path, pattern: str | None, frame_ids: Collection[str])
                 f"{results}: {shown} fits detector.options.results.path = {pattern!r}; one result "
                 "was expected"
             )
-        return found[0]
+        return found[0], "auto"
     files = [each for each in results.iterdir() if not each.name.startswith(".")]
     if len(files) == 1 and files[0].is_file() and files[0].stem not in frame_ids:
-        return files[0]
-    if any(each.suffix in (".txt", ".json") for each in results.rglob("*")):
-        return results  # a file per frame
+        return files[0], "auto"
+    separate = [each for each in results.rglob("*") if each.suffix in (".txt", ".json")]
+    frames = FrameNames(frame_ids)
+    of_frames = [
+        each for each in separate if frames.find(each.relative_to(results).as_posix()) is not None
+    ]
+    suffixes = {each.suffix for each in of_frames}
+    parents = {each.parent for each in of_frames}
+    if suffixes == {".txt"}:
+        return results, "kitti"
+    if suffixes == {".json"} and len(parents) == 1:
+        return parents.pop(), "mmdetection3d"
+    whole = [each for each in files if each.suffix.lower() in SUFFIXES and each.is_file()]
+    if not suffixes and len(whole) == 1:
+        return whole[0], "auto"
+    if separate and not whole:
+        return results, "auto"  # under other names than those of the frames: the error lists them
     names = ", ".join(sorted(each.name for each in files)[:3])
     raise ModelError(
         f"{results}: contains {names}; set detector.options.results.path to the file of the results"

@@ -224,9 +224,20 @@ class RecordedDetector:
         Raises:
             DataError: if a file cannot be read.
         """
+        return frozenset().union(*self.names_by_path().values())
+
+    def names_by_path(self) -> Mapping[Path, frozenset[str]]:
+        """Return the category names in the results of the frames and in those of each view.
+
+        Raises:
+            DataError: if a file cannot be read.
+        """
         names = self._record.category_names()
         own = frozenset(self.rename.get(name, name) for name in names)
-        return own.union(*(view.category_names() for view in self.views_of_copies))
+        return {
+            self.path: own,
+            **{view.path: view.category_names() for view in self.views_of_copies},
+        }
 
     def predict(self, frame: Frame) -> Detections:
         """Return the stored result of the original frame; `frame.points` is not used.
@@ -350,7 +361,8 @@ class RecordedDetector:
         if unmatched and only_these:
             raise DataError(
                 f"{self.path}: results for frames that were not requested ({examples}); the "
-                "detector must read the frames that it is given, not the whole data set"
+                "detector must read the frames that it is given, not the whole data set, and write "
+                "logs and other files elsewhere"
             )
         if unmatched and not found:
             raise DataError(

@@ -24,7 +24,15 @@ _LISTS: Mapping[str, Callable[[Path, Sequence[Any], ReadOptions], ResultsByFrame
     "mmdetection3d": read_mmdetection3d,
 }
 KINDS = ("csv", "parquet", "kitti", *_LISTS, "nuscenes", "argoverse2", "st3d")
-_LIST_SUFFIXES = (".pkl", ".pickle", ".json")
+_KINDS_BY_SUFFIX = {
+    ".csv": "csv",
+    ".parquet": "parquet",
+    ".feather": "argoverse2",
+    **dict.fromkeys((".pkl", ".pickle", ".json"), "list"),
+}
+SUFFIXES = tuple(_KINDS_BY_SUFFIX)
+"""Suffixes of files with the results of several frames."""
+
 _EXPECTED = (
     "a .csv or .parquet file, a folder of KITTI result files, OpenPCDet's result.pkl, "
     "mmdetection3d's results as .pkl, .json or a folder of .json, nuScenes' results as .json, "
@@ -42,12 +50,9 @@ def detect_kind(path: Path) -> str:
         raise DataError(f"{path}: no such file of recorded detections")
     if path.is_dir():
         return "mmdetection3d" if any(path.glob("*.json")) else "kitti"
-    kinds = {".csv": "csv", ".parquet": "parquet", ".feather": "argoverse2"} | dict.fromkeys(
-        _LIST_SUFFIXES, "list"
-    )
-    if path.suffix.lower() not in kinds:
+    if path.suffix.lower() not in _KINDS_BY_SUFFIX:
         raise DataError(f"{path}: not a supported format of detections; expected {_EXPECTED}")
-    return kinds[path.suffix.lower()]
+    return _KINDS_BY_SUFFIX[path.suffix.lower()]
 
 
 def read_results(path: Path, kind: str, options: ReadOptions) -> ResultsByFrame:

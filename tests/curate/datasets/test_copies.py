@@ -228,3 +228,43 @@ def test_frames_of_recordings_keep_their_names(tmp_path: Path) -> None:
     assert writer.kind == "kitti"
     for name, similarity in similarities_of.items():
         assert_is_copy(again.read(name), dataset.read(name), similarity)
+
+
+@pytest.mark.parametrize("kind", ["kitti", "folder", "nuscenes"])
+def test_a_copy_with_a_damaged_calibration_or_image_is_written_again(
+    tmp_path: Path, kind: str
+) -> None:
+    """Its points are whole, but the files beside them were deleted or cut off."""
+    root, folder = tmp_path / "data", tmp_path / "copies"
+    if kind == "kitti":
+        write_toy_kitti(root, 1)
+        dataset = KittiDataset(root)
+    elif kind == "folder":
+        write_toy_folder(root)
+        dataset = FolderDataset(root)
+    else:
+        write_nuscenes(root)
+        dataset = NuScenesDataset(root)
+    frame_id = dataset.frame_ids()[0]
+    writer = copy_writer(dataset, folder, {frame_id: TURNED})
+    write_all(writer)
+    points = next((folder / writer.clouds).iterdir())
+    beside = [
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path != points and {"samples", "calib", "images", "image_2"} & {
+            *path.parent.relative_to(folder).parts
+        }
+    ]  # fmt: skip
+    assert beside
+    whole = {path: path.read_bytes() for path in beside}
+    for path, content in whole.items():
+        for left in (None, b"", content[: len(content) // 2], content[:-1]):
+            path.unlink()
+            if left is not None:
+                path.write_bytes(left)
+            assert not writer.is_written(frame_id), (path, left)
+            writer.write(frame_id)
+            assert writer.is_written(frame_id)
+            assert path.read_bytes() == content
+    assert dataset.files(frame_id).points.exists()

@@ -56,6 +56,13 @@ def test_results_of_the_copies_are_accepted() -> None:
     assert examine_copies(0, []) == describe_few_matches(0, []) == describe_headings(0, []) == ""
 
 
+def test_copies_without_any_box_are_a_warning() -> None:
+    nothing = frames(lambda _, boxes: boxes[:1])
+    assert examine_copies(0, nothing) == ""
+    assert "no boxes in 30 copies, but 120 in their frames" in describe_few_matches(0, nothing)
+    assert describe_few_matches(0, nothing[:4]) == ""
+
+
 @pytest.mark.parametrize(
     ("found_in", "message"),
     [

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from contracts.samples import assert_one_line
 
 from curate.errors import ConfigError
 from curate.files.user_command import UserCommand, describe_end
@@ -76,6 +77,80 @@ def test_a_program_is_looked_for_before_it_is_needed(tmp_path: Path) -> None:
         UserCommand.parse("c", "no-such-program {clouds}").check_program()
     with pytest.raises(ConfigError, match=r"infer\.sh cannot be started: it is not an executable"):
         UserCommand.parse("c", shlex.quote(str(text))).check_program()
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("cd det && python infer.py {clouds}", "&&"),
+        ("python infer.py {clouds} | tee log", "|"),
+        ("sh a.sh; sh b.sh", ";"),
+        ("sh infer.sh {clouds} >log 2>&1", ">log"),
+        ("sh infer.sh {clouds} &", "&"),
+        ("sh infer.sh < input", "<"),
+        ("~/det/infer {clouds}", "~"),
+        ("docker run -v ~/data:/data infer", "~"),
+        ("docker run -v $HOME/data:/data infer", "$HOME"),
+        ('python "$HOME/infer.py"', "$HOME"),
+        ("python ${HOME}/infer.py", "${HOME}"),
+        ("infer $(cat list)", "$("),
+        ("infer `cat list`", "`"),
+        ("CUDA_VISIBLE_DEVICES=1 python infer.py", "CUDA_VISIBLE_DEVICES="),
+    ],
+)
+def test_shell_syntax_is_reported_with_what_to_write(text: str, found: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        UserCommand.parse("train command", text).check(tmp_path)
+    assert_one_line(caught.value)
+    assert f"train command: `{found}` is shell syntax" in str(caught.value)
+    assert "sh -c '...'" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sh -c 'cd x && infer $CURATE_DATA > log; true'",
+        'sh -c "cd x && infer $CURATE_DATA | tee ~/log"',
+        "env CUDA_VISIBLE_DEVICES=1 true --in={clouds} --size=3",
+        "true '$HOME' 'a;b' '&&' \\$HOME file~ a&b 50% x->y --pattern=.*[.]bin$ **/a {a,b}",
+    ],
+)
+def test_quoted_and_harmless_text_is_no_shell_syntax(text: str, tmp_path: Path) -> None:
+    UserCommand.parse("c", text).check(tmp_path)
+
+
+def test_relative_paths_start_at_the_folder_in_which_the_command_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A script that is only in the current folder is reported with its whole path."""
+    here, home = tmp_path / "here", tmp_path / "home"
+    for folder in (here, home / "bin"):
+        folder.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    (here / "infer.py").touch()
+    (here / "infer").write_text("#!/bin/sh\n")
+    (here / "infer").chmod(0o755)
+    with pytest.raises(ConfigError) as caught:
+        UserCommand.parse("c", "python3 -u infer.py {clouds}").check(home)
+    assert str(caught.value) == (
+        f"c: {home}/infer.py: no such file; paths are relative to the workspace, write "
+        f"{here}/infer.py"
+    )
+    with pytest.raises(ConfigError, match=f"no such file; .*, write {here}/infer"):
+        UserCommand.parse("c", "./infer {clouds}").check(home)
+    with pytest.raises(ConfigError, match=r"sh: .*missing\.sh: no such file$"):
+        UserCommand.parse("sh", "bash missing.sh").check(home)
+    for unknown in ("python3 -m infer", "python3 -X dev infer.py", "sh -c infer", "python3"):
+        UserCommand.parse("c", unknown).check(home)
+    tool = home / "bin" / "tool.sh"
+    tool.write_text("pwd; cat bin/tool.sh >/dev/null && echo read\n")
+    tool.chmod(0o755)
+    with (tmp_path / "log").open("wb") as output:
+        for text in ("sh bin/tool.sh", f"sh {tool}"):
+            command = UserCommand.parse("c", text)
+            command.check(home)
+            assert command.run({}, output, folder=home) == 0
+    assert (tmp_path / "log").read_text().split() == [str(home), "read"] * 2
 
 
 def test_output_environment_and_exit_code_are_those_of_the_command(tmp_path: Path) -> None:

@@ -1,16 +1,20 @@
 """Rounds with a detector that runs elsewhere: equal rows, failures, checks before the first row."""
 
 import json
+import os
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
+from contracts.samples import assert_one_line
 from support.external_detector import command_of, write_script
 from support.pipelines_cli import Curate
 from support.rounds import run_stage, run_workspace
 from support.stored_rows import dump, rows
 from support.toys import toy_document, write_toy_kitti
 
-from curate.errors import ConfigError, FramesFailed, ModelError
+from curate.errors import ConfigError, FramesFailed, ModelError, WorkspaceError
 from pipelines.round import open_plan
 from pipelines.stages import predict, repredict
 from pipelines.stages.predict import TRIAL_FRAMES
@@ -37,6 +41,38 @@ def make(root: Path, home: Path, command: str | None = None, **settings) -> Work
     for name, section in settings.items():
         document[name] = document.get(name, {}) | section
     return initialise(root, make_config(document, "test"), "0.04", "")
+
+
+KITTI_RESULTS = """
+import sys
+from pathlib import Path
+import numpy as np
+from oracles.openpcdet_kitti import Calibration, write_results
+from support.toys import INTENSITIES, SIZES
+from curate.datasets.kitti.dataset import KittiDataset
+from curate.geometry.mounting import rotations_y_of_yaws
+
+data, results, meaning = sys.argv[1:]
+dataset = KittiDataset(Path(data))
+for name in dataset.frame_ids():
+    frame, boxes = dataset.read(name), []
+    for category, intensity in INTENSITIES.items():
+        seen = frame.points[np.abs(frame.points[:, 3] - intensity) < 0.01, :3]
+        x, y = np.linalg.svd(seen[:, :2] - seen[:, :2].mean(axis=0))[2][0]
+        boxes.append([*seen.mean(axis=0), *SIZES[category], np.arctan2(y, x)])
+    boxes = np.array(boxes)
+    boxes[:, 6] = -np.pi / 2 - rotations_y_of_yaws(boxes[:, 6], frame.calibration, meaning)
+    calibration = Calibration(dataset.files(name).calibration)
+    scores = np.full(len(boxes), 0.9)
+    write_results(Path(results) / f"{name}.txt", boxes, scores, list(SIZES), calibration)
+"""
+
+
+def writing_rotation_y(home: Path, meaning: str) -> str:
+    """Return the command that writes KITTI result files with rotation_y of a meaning."""
+    (home / "kitti_results.py").write_text(KITTI_RESULTS)
+    program = shlex.join([sys.executable, str(home / "kitti_results.py")])
+    return f"{program} {{data}} {{results}} {meaning}"
 
 
 def with_modes(home: Path, modes: Path, *lines: str) -> str:
@@ -128,6 +164,21 @@ def test_failures_in_a_row_end_the_run(home: Path, tmp_path: Path) -> None:
     assert states(workspace, "predict") == {"done": TRIAL_FRAMES, "failed": 6}
 
 
+@pytest.mark.parametrize("modes", [["", "", "exit", "exit", "exit"], ["", "", "", "exit", "exit"]])
+def test_failures_at_the_end_of_a_run_count_as_those_before(
+    home: Path, tmp_path: Path, modes: list[str]
+) -> None:
+    """Fifteen frames after the trial in batches of 4, 4, 4 and 3: the last batch is small."""
+    command = with_modes(home, tmp_path / "modes", *modes)
+    workspace = make(tmp_path / "work", home, command).with_settings("detector", batch_size=4)
+    if modes.count("exit") < 3:
+        assert run_stage(workspace, "predict").failed == 7
+        return
+    with pytest.raises(ModelError, match="11 frames in a row failed"):
+        run_stage(workspace, "predict")
+    assert states(workspace, "predict") == {"done": TRIAL_FRAMES + 4, "failed": 11}
+
+
 def test_results_of_the_original_frames_are_rejected(home: Path, tmp_path: Path) -> None:
     """A command that reads the data set, not the copies, would show perfect consistency."""
     script = home / "my detector" / "infer.py"
@@ -141,6 +192,33 @@ def test_results_of_the_original_frames_are_rejected(home: Path, tmp_path: Path)
     run_stage(workspace, "predict")
     with pytest.raises(ModelError, match="these are results of the original frames"):
         run_stage(workspace, "repredict")
+
+
+def test_headings_are_compared_with_labels_before_anything_is_stored(
+    curate: Curate,
+    home: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The camera looks along x, so the frames themselves do not show the meaning of rotation_y."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    document = toy_document(home / "kitti", home / "segmenter.txt")
+
+    options = {"command": writing_rotation_y(home, "calibration")}
+    document["detector"] = {"name": "command", "options": options}
+    wrong = initialise(tmp_path / "work", make_config(document, "test"), "0.5", "")
+    setting = 'set detector.options.results.rotation_y = "calibration"'
+    with pytest.raises(ModelError, match=setting) as caught:
+        run_stage(wrong, "predict")
+    assert_one_line(caught.value)
+    assert states(wrong, "predict") == {}
+    assert len(list((wrong.root / "logs").iterdir())) == 1
+    code, out, _ = curate("doctor", "-w", wrong.root)
+    assert (code, setting in out) == (1, True)
+    options |= {"results": {"rotation_y": "calibration"}}
+    assert run_stage(wrong.with_settings("detector", options=options), "predict").failed == 0
+    assert "turned copies of labeled frames" not in caplog.text
 
 
 def test_predictions_depend_on_command_files_and_teacher_but_not_on_time_limits(
@@ -174,15 +252,37 @@ def test_predictions_depend_on_command_files_and_teacher_but_not_on_time_limits(
         predict.check(missing)
 
 
+def test_a_stage_without_its_input_names_the_command_that_makes_it(
+    curate: Curate, home: Path, tmp_path: Path
+) -> None:
+    """Also after a change of the detector's options, which makes its predictions outdated."""
+    workspace = make(tmp_path / "work", home)
+    root = workspace.root
+    hint = "run `curate predict --split labeled` first, or `curate run` for all stages"
+    for more in ([], ["--dry-run"]):
+        code, _, err = curate("repredict", "--split", "labeled", "-w", root, *more)
+        assert (code, err.count("\n")) == (WorkspaceError.exit_code, 1)
+        assert "predict of 1 labeled frames in round 1 is missing or out of date" in err
+        assert hint in err
+    assert curate("predict", "--split", "labeled", "-w", root)[0] == 0
+    assert curate("repredict", "--split", "labeled", "-w", root)[0] == 0
+    config = root / "curate.toml"
+    config.write_text(config.read_text().replace("{clouds}", "{clouds} "))
+    config.write_text(config.read_text().replace("{results}", "{results} ''"))
+    for command in ("repredict", "score"):
+        code, _, err = curate(command, "--split", "labeled", "-w", root)
+        assert (code, hint in err) == (WorkspaceError.exit_code, True)
+
+
 def test_mistakes_are_found_by_init_and_doctor(curate: Curate, home: Path, tmp_path: Path) -> None:
     """`init` knows the program and the placeholders, `doctor` runs the command on a frame."""
     script = home / "my detector" / "infer.py"
 
-    def init(command: str) -> tuple[int, str, str]:
+    def init(command: str, *more: str) -> tuple[int, str, str]:
         return curate(
             "init", tmp_path / "work", "--root", home / "kitti", "--labeled", "0.1",
             "--detector", "command", "--set", f"detector.options.command={command}",
-            "--set", 'run.priors=["points"]',
+            "--set", 'run.priors=["points"]', *more,
         )  # fmt: skip
 
     for command, reason in {
@@ -192,12 +292,25 @@ def test_mistakes_are_found_by_init_and_doctor(curate: Curate, home: Path, tmp_p
         code, _, err = init(command)
         assert (code, err.count("\n")) == (ConfigError.exit_code, 1)
         assert reason in err
+    for setting, reason in {
+        "detector.options.command=python infer.py {data} {results}": "infer.py: no such file",
+        "detector.options.files=['model.yaml']": "model.yaml: no such file",
+        "train.command=cd x && python train.py": "train command: `&&` is shell syntax",
+    }.items():
+        code, _, err = init(command_of(script), "--set", setting)
+        assert (code, err.count("\n")) == (ConfigError.exit_code, 1)
+        assert reason in err
     assert not (tmp_path / "work").exists()
-    code, _, err = init(command_of(script))
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "model.yaml").touch()
+    code, _, err = init(command_of(script), "--set", "detector.options.files=['model.yaml']")
     assert code == 0, err
     code, out, err = curate("doctor", "-w", tmp_path / "work", "--json")
     findings = {(each["check"], each["state"]) for each in json.loads(out)["findings"]}
-    assert ("views", "ok") in findings, out + err
+    assert {("views", "ok"), ("headings", "ok")} <= findings, out + err
+    (tmp_path / "work" / "model.yaml").unlink()
+    _, out, _ = curate("doctor", "-w", tmp_path / "work")
+    assert "model.yaml: no such file" in out
 
 
 def test_evaluate_runs_the_command_on_val_frames(

@@ -218,6 +218,8 @@ def test_a_long_log_is_shortened(
         ({"result.csv": 1, "notes.log": 1}, {"path": "result.csv", "kind": "csv"}, None),
         ({"a.csv": 1, "b.csv": 1}, {"path": "*.csv"}, "a.csv, b.csv fits"),
         ({"a.csv": 1}, {"path": "b.csv"}, "nothing fits"),
+        ({"result.csv": 1, "log.txt": 1, "plot.png": 1}, {}, None),
+        ({"result.csv": 1, "logs/log.json": 1, "lock": 1}, {}, None),
         ({"a.csv": 1, "b.csv": 1}, {}, "contains a.csv, b.csv; set detector.options.results.path"),
     ],
 )
@@ -235,6 +237,32 @@ def test_results_are_found_by_a_pattern(
         assert found.boxes.tolist() == [[9, 1, -1, 4, 2, 1.5, 0]]
     else:
         assert reason in str(found)
+
+
+@pytest.mark.parametrize(
+    ("files", "reason"),
+    [
+        ("0.txt 000001.txt metrics.json", None),
+        ("data/000000.txt data/000001.txt summary.json", None),
+        ("preds/000000.json preds/1.json log.txt", None),
+        ("000000.txt 000001.txt log.txt", "not requested (log); the detector must read the frames"),
+    ],
+)  # fmt: skip
+def test_a_file_per_frame_may_have_others_beside_it(
+    root: Path, tmp_path: Path, files: str, reason: str | None
+) -> None:
+    """Those of the other kind are left out; a log with the suffix of the results is explained."""
+    nothing = '{"bboxes_3d": [], "scores_3d": [], "labels_3d": [], "box_type_3d": "LiDAR"}'
+    text = f"""cd "$2"; mkdir -p data preds
+for each in {files}; do case $each in preds/*) echo '{nothing}';; esac > $each; done
+"""
+    command = f"sh {_script(tmp_path, text)} {{data}} {{results}}"
+    made = detector(root, tmp_path, command, results={"classes": ["Car"]})
+    found = made.predict_copies(dict.fromkeys(FRAMES[:2]))
+    if reason is None:
+        assert [len(each) for each in found] == [0, 0]
+    else:
+        assert reason in str(found[0])
 
 
 @pytest.mark.parametrize(
