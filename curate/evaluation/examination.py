@@ -19,8 +19,8 @@ _OUTSIDE_LIMIT = 0.1
 # A sweep without a point of at least this intensity was divided by too large a scale.
 _DARK = 0.02
 _MISPLACED = (
-    "lie beside the points: the model has hardly been trained, or for another LiDAR, mounting height "
-    "or range of intensities"
+    "lie beside the points: the model has hardly been trained, or for another LiDAR, mounting "
+    "height or range of intensities"
 )
 
 

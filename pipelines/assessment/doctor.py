@@ -144,7 +144,10 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
         *_names(detector_differences(config, detector)),
         *([Finding("results", "suspect", missing)] if missing else []),
         *examine_detections(
-            seen, found, config.dataset.categories, _other_results(workspace, detector, frame),
+            seen,
+            found,
+            config.dataset.categories,
+            _other_results(workspace, detector, frame),
             trainable=is_trainable(workspace),
         ),
     ]

@@ -18,7 +18,7 @@ from curate.detectors.openpcdet.pooling import NearMaximum, near_voxels
 from curate.detectors.openpcdet.roi_head import refine
 from curate.detectors.openpcdet.sparse import Sites
 from curate.detectors.openpcdet.voxels import make_voxels
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, ModelError
 from curate.frames import Frame, calibration_without_camera
 from curate.geometry.similarity import wrap_angle
 from curate.warnings_once import warn_once
@@ -151,11 +151,42 @@ def test_sweeps_with_hardly_any_points_are_predicted(tmp_path, name: str, count:
     assert (len(found) > 0) == (count > 0)
 
 
-def test_points_outside_the_range_have_no_boxes(tmp_path) -> None:
+def test_points_outside_the_range_have_no_boxes(tmp_path, caplog) -> None:
+    """Once per process, this is reported."""
+    warn_once.cache_clear()
     points = sweep()
     points[:, 0] += 1000
     detector = OpenPCDetDetector(write_files(tmp_path), minimum_score=0.0)
-    assert len(detector.predict(frame_of(points))) == 0
+    with caplog.at_level(logging.WARNING):
+        assert len(detector.predict(frame_of(points))) == 0
+    (message,) = caplog.messages
+    assert message.startswith("frame 000000: none of its 6000 points is in POINT_CLOUD_RANGE")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [1e38, 1e15])
+def test_weights_that_overflow_are_reported(name: str, value: float) -> None:
+    """NaN scores would silently be no boxes, and proposals far away must not crash the pooling."""
+    network = random_network(name)
+    with torch.no_grad():
+        for key, each in network.named_parameters():
+            if key.startswith("dense_head.conv_box") or (value > 1e30 and each.dim() > 1):
+                each.fill_(value)
+    if value > 1e30:
+        with pytest.raises(ModelError, match="frame 7: the network computes NaN or infinite"):
+            detect(network, sweep(), 0.1, "7")
+    else:
+        assert np.isfinite(detect(network, sweep(), 0.1, "7").boxes).all()
+
+
+@pytest.mark.parametrize("cell", [-(2**63), 2**63 - 1, 2**40])
+def test_no_voxel_is_near_a_cell_far_away(cell: int) -> None:
+    """The cell of a coordinate that is NaN or huge can be any integer."""
+    sites, _ = Sites.of(torch.zeros((1, 4), dtype=torch.int64), (4, 9, 8), 1)
+    cells = torch.tensor([[0, cell, 0, 0], [0, 0, cell, 0], [0, 0, 0, cell], [0, cell, cell, cell]])
+    far = torch.full((4, 3), 1e9)
+    near = near_voxels(sites, torch.zeros(1, 3), cells, far, (1, 2, 3), 2.2, 3)
+    assert (near == -1).all()
 
 
 def test_more_voxels_than_the_cap_are_reported(tmp_path, caplog) -> None:
