@@ -114,7 +114,7 @@ def examine_detections(
     return [
         Finding("detections", "ok", f"{len(found)} boxes, scores {low:.2f} to {high:.2f}"),
         _names(found, categories),
-        _points(frame, found),
+        _points(frame, found, trainable=trainable),
         *([_projections(frame, found)] if frame.cameras else []),
         _convention([(frame, found), *others], trainable=trainable),
     ]
@@ -132,11 +132,12 @@ def _names(found: Detections, categories: Sequence[str]) -> Finding:
     return Finding("names", "ok", summary)
 
 
-def _points(frame: Frame, found: Detections) -> Finding:
+def _points(frame: Frame, found: Detections, *, trainable: bool) -> Finding:
     empty = int(np.sum(count_points_in_boxes(frame.points, found.boxes) == 0))
     summary = f"{empty} of {len(found)} boxes contain no points"
     if empty == len(found):
-        return Finding("boxes", "wrong", f"{summary}: they are not in the LiDAR frame")
+        cause = f"they {_MISPLACED}" if trainable else "they are not in the LiDAR frame"
+        return Finding("boxes", "wrong", f"{summary}: {cause}")
     return Finding("boxes", "suspect" if empty > len(found) / 2 else "ok", summary)
 
 

@@ -11,6 +11,7 @@ import pickle
 import struct
 import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,8 +141,11 @@ def load_weights(
     surplus = [name for name in given if name not in expected]
     if missing or surplus:
         faults = [
-            f"{what} {_listed(names)}"
-            for what, names in (("has no", missing), ("has also", surplus))
+            f"{what} {_listed(_gathered(names, others))}"
+            for what, names, others in (
+                ("has no", missing, given),
+                ("has also", surplus, expected),
+            )
             if names
         ]
         raise ModelError(f"{place}: not a checkpoint of {file}: it {' and '.join(faults)}")
@@ -219,9 +223,10 @@ def _content(path: Path) -> Mapping[str, Any]:
                 "again with only tensors, numbers and strings"
             ) from None
         raise ModelError(f"{path}: {_UNREADABLE}") from None
-    except _DAMAGED as error:
-        system = isinstance(error, OSError) and error.strerror
-        raise ModelError(f"{path}: {system or _UNREADABLE}") from None
+    except (IsADirectoryError, PermissionError) as error:
+        raise ModelError(f"{path}: not a readable checkpoint: {error.strerror}") from None
+    except _DAMAGED:
+        raise ModelError(f"{path}: {_UNREADABLE}") from None
     if not isinstance(content, dict) or not isinstance(content.get("model_state"), dict):
         raise ModelError(f"{path}: not a checkpoint of OpenPCDet: it has no model_state")
     return content
@@ -269,6 +274,15 @@ def _shape(tensor: Tensor) -> str:
     """Return the shape as text, with the type of other numbers than floats."""
     kind = "" if tensor.is_floating_point() else f" {tensor.dtype}".replace("torch.", "")
     return ("x".join(map(str, tensor.shape)) or "a number") + kind
+
+
+def _gathered(names: list[str], others: Mapping[str, Tensor]) -> list[str]:
+    """Return the names, with `module.*` in place of several of a module that the others lack."""
+    known = {name.partition(".")[0] for name in others}
+    counts = Counter(name.partition(".")[0] for name in names)
+    whole = {module for module, count in counts.items() if count > 1} - known
+    modules = ((name, name.partition(".")[0]) for name in names)
+    return list(dict.fromkeys(f"{each}.*" if each in whole else name for name, each in modules))
 
 
 def _listed(names: list[str]) -> str:

@@ -140,10 +140,15 @@ class OpenPCDetDetector:
         if np.isnan(heights).all():
             return
         below = -float(np.nanmedian(heights))
-        if abs(below - self._height) > _TOLERANCE_METRES:
+        if abs(below - self._height) <= _TOLERANCE_METRES:
+            return
+        self._frames = _CHECKED_FRAMES
+        if below < -_TOLERANCE_METRES:
+            warn_once(f"the ground is {-below:.1f} m above the origin of the points: is z up?")
+        else:
             warn_once(
-                f"the ground is {below:.1f} m below the LiDAR; the detector expects "
-                f"{self._height:g} m: set detector.options.lidar_height = {below:.1f}"
+                f"the ground is {max(below, 0):.1f} m below the LiDAR; the detector expects "
+                f"{self._height:g} m: set detector.options.lidar_height = {max(below, 0):.1f}"
             )
 
 

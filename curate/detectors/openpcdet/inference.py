@@ -35,15 +35,14 @@ def detect(
     voxels = make_voxels([points], network.file.data_config)
     if len(voxels.counts) == 0:
         warn_once(
-            f"frame {place}: none of its {len(points)} points is in POINT_CLOUD_RANGE of the model "
-            "file, so it has no boxes"
+            "some frames have no points in POINT_CLOUD_RANGE of the model file: they get no boxes"
         )
         return Detections.empty()
     if voxels.left_out[0]:
         cap = network.file.data_config.voxels.max_number_of_voxels.test
         warn_once(
-            f"frame {place} has {len(voxels.counts) + voxels.left_out[0]} voxels; the model file "
-            f"keeps {cap} (MAX_NUMBER_OF_VOXELS): points beyond them are not seen"
+            f"some frames have more voxels; the model file keeps {cap} (MAX_NUMBER_OF_VOXELS): "
+            "points beyond them are not seen"
         )
     with torch.inference_mode():
         stage = network(Batch.of(voxels, network.anchors.device))

@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -152,15 +153,16 @@ def test_sweeps_with_hardly_any_points_are_predicted(tmp_path, name: str, count:
 
 
 def test_points_outside_the_range_have_no_boxes(tmp_path, caplog) -> None:
-    """Once per process, this is reported."""
+    """This is reported once, not for every frame."""
     warn_once.cache_clear()
     points = sweep()
     points[:, 0] += 1000
     detector = OpenPCDetDetector(write_files(tmp_path), minimum_score=0.0)
     with caplog.at_level(logging.WARNING):
-        assert len(detector.predict(frame_of(points))) == 0
+        for name in ("1", "2"):
+            assert len(detector.predict(replace(frame_of(points), frame_id=name))) == 0
     (message,) = caplog.messages
-    assert message.startswith("frame 000000: none of its 6000 points is in POINT_CLOUD_RANGE")
+    assert message.startswith("some frames have no points in POINT_CLOUD_RANGE of the model file")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -196,7 +198,9 @@ def test_more_voxels_than_the_cap_are_reported(tmp_path, caplog) -> None:
     config = path.with_suffix(".yaml")
     config.write_text(config.read_text().replace('"test": 40000', '"test": 500'))
     with caplog.at_level(logging.WARNING):
-        found = OpenPCDetDetector(path).predict(frame_of(sweep()))
+        detector = OpenPCDetDetector(path)
+        detector.predict(replace(frame_of(sweep(seed=1)), frame_id="1"))
+        found = detector.predict(frame_of(sweep()))
     assert len(caplog.messages) == 1
     assert "voxels; the model file keeps 500 (MAX_NUMBER_OF_VOXELS)" in caplog.messages[0]
     assert np.isfinite(found.boxes).all()
@@ -229,6 +233,9 @@ def test_the_height_of_the_ground_is_checked_and_can_be_shifted(tmp_path, caplog
         caplog.clear()
         found = OpenPCDetDetector(path, lidar_height=2.73).predict(frame_of(higher))
         assert caplog.messages == []
+        raised = points + np.array([0, 0, 3.4, 0], dtype=np.float32)
+        OpenPCDetDetector(path).predict(frame_of(raised))
+        assert caplog.messages == ["the ground is 1.7 m above the origin of the points: is z up?"]
     assert len(found) == len(expected) > 0
     assert_allclose(found.boxes[:, 2], expected.boxes[:, 2] - 1, atol=1e-3)
     with pytest.raises(ConfigError, match="lidar_height"):
