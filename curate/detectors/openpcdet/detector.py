@@ -1,13 +1,13 @@
 """PointPillar, SECOND and Voxel R-CNN: checkpoints of OpenPCDet, or trained by curate."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from curate.detections import Detections
+from curate.detections import CATEGORIES, Detections
 from curate.detectors.openpcdet.presets import FORMAT_VERSION, PRESETS
 from curate.errors import ConfigError, DataError, first_line
 from curate.files.paths import StrPath
@@ -16,6 +16,7 @@ from curate.geometry.ground import GroundMap
 from curate.warnings_once import warn_once
 
 if TYPE_CHECKING:
+    from curate.detectors.openpcdet.schema import ModelFile
     from curate.detectors.openpcdet.training import AnchorStudent
 
 # Height of KITTI's LiDAR above the ground in metres. The anchors of the public models fit it.
@@ -63,8 +64,10 @@ class OpenPCDetDetector:
 
         from curate.detectors.openpcdet.checkpoint import load_network
 
-        if not 0 <= lidar_height < 100:
-            raise ConfigError(f"detector.options.lidar_height {lidar_height}: give metres")
+        if not (isinstance(lidar_height, int | float) and 0 <= lidar_height < 100):
+            raise ConfigError(
+                f"detector.options.lidar_height {lidar_height!r}: expected metres, 0 to 100"
+            )
         network, _ = load_network(Path(checkpoint), None if config is None else Path(config))
         try:
             self._network = network.to(torch.device(device))
@@ -101,6 +104,30 @@ class OpenPCDetDetector:
         from curate.detectors.openpcdet.training import AnchorStudent
 
         return AnchorStudent.load(checkpoint, None if config is None else Path(config))
+
+    @classmethod
+    def score_meaning(
+        cls, preset: str, checkpoint: Path | None = None, options: Mapping[str, Any] | None = None
+    ) -> str:
+        """See `curate.detectors.base.DescribesScores`; Voxel R-CNN learns the overlap of a box."""
+        from curate.detectors.openpcdet.presets import preset_file
+        from curate.detectors.openpcdet.schema import load_model_file
+
+        config = (options or {}).get("config")
+        file: ModelFile | None
+        if checkpoint is None:
+            file = preset_file(preset, CATEGORIES)
+        elif config is not None:
+            file = load_model_file(Path(config))
+        else:
+            from curate.detectors.openpcdet.checkpoint import load_checkpoint
+
+            file = load_checkpoint(checkpoint).file
+        if file is None or file.model.roi_head is None:
+            return "the probability of the category"
+        learned = file.model.roi_head.target_config
+        low, high = learned.cls_bg_thresh, learned.cls_fg_thresh
+        return f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
 
     @property
     def categories(self) -> tuple[str, ...]:

@@ -121,6 +121,11 @@ class PillarDetector:
         return self.categories
 
     @classmethod
+    def score_meaning(cls, *_: object) -> str:
+        """See `curate.detectors.base.DescribesScores`."""
+        return "the probability that an object of the category has its centre there (heat map)"
+
+    @classmethod
     def batch_size(cls, device: str) -> int:
         """See `curate.detectors.base.BatchDetector`."""
         return 1 if device == CPU.name else _GPU_BATCH
