@@ -138,6 +138,28 @@ class DescribesScores(Protocol):
         ...
 
 
+@runtime_checkable
+class ExportsOnnx(Protocol):
+    """A detector with a network that can be written as an ONNX model."""
+
+    @classmethod
+    def export_onnx(
+        cls, checkpoint: Path, output: Path, options: Mapping[str, Any]
+    ) -> tuple[str, ...]:
+        """Write a checkpoint as an ONNX model; return its inputs, outputs and use, in lines.
+
+        Args:
+            checkpoint: the checkpoint.
+            output: the file to write.
+            options: `detector.options`.
+
+        Raises:
+            ConfigError: if ONNX has no operators for the network.
+            ModelError: if the checkpoint cannot be used, or the file cannot be written.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Sample:
     """One training frame with its weighted labels.

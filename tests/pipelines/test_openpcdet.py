@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -198,3 +200,26 @@ def test_every_detector_says_what_its_score_estimates(
     found = score_meaning(config)
     assert found == meaning if meaning is None else meaning in str(found)
     assert describe_score(found).startswith("estimates " if meaning else "has no known meaning")
+
+
+def test_a_model_is_exported_to_onnx(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """The newest checkpoint by default; the printed line uses it, and others say why not."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, "--detector-path", write_files(tmp_path, "PointPillar"))
+    code, out, err = curate("export-model", "-w", work)
+    assert code == 0, err
+    model = work / "exports" / "model.onnx"
+    assert f"{tmp_path / 'model.pth'} in {model}" in out
+    flags = shlex.split(re.search(r"in curate: (--detector.*)", out)[1])
+    other = tmp_path / "other"
+    code, _, err = curate("init", other, "--root", toy_kitti, "--labeled", "0.25", *flags)
+    assert code == 0, err
+    assert "6 frames done" in curate("predict", "-w", other)[1]
+    code, _, err = curate("export-model", "-w", other)
+    assert (code, err) == (
+        ConfigError.exit_code, "error: detector 'onnx' has no network that curate can export\n"
+    )  # fmt: skip
+    sparse = write_files(tmp_path, "SECONDNet")
+    code, _, err = curate("export-model", "--checkpoint", sparse, "-w", work)
+    assert code == ConfigError.exit_code
+    assert err.startswith("error: SECONDNet cannot be exported: ONNX has no sparse convolution")

@@ -64,10 +64,7 @@ class OpenPCDetDetector:
 
         from curate.detectors.openpcdet.checkpoint import load_network
 
-        if not (isinstance(lidar_height, int | float) and 0 <= lidar_height < 100):
-            raise ConfigError(
-                f"detector.options.lidar_height {lidar_height!r}: expected metres, 0 to 100"
-            )
+        _checked_height(lidar_height)
         network, _ = load_network(Path(checkpoint), None if config is None else Path(config))
         try:
             self._network = network.to(torch.device(device))
@@ -129,6 +126,32 @@ class OpenPCDetDetector:
         low, high = learned.cls_bg_thresh, learned.cls_fg_thresh
         return f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
 
+    @classmethod
+    def export_onnx(
+        cls, checkpoint: Path, output: Path, options: Mapping[str, Any]
+    ) -> tuple[str, ...]:
+        """See `curate.detectors.base.ExportsOnnx`."""
+        from curate.detectors.openpcdet.checkpoint import load_network
+        from curate.detectors.openpcdet.onnx_graph import build_graph
+        from curate.files.onnx_graph import write_model
+        from curate.files.toml_text import toml
+
+        config = options.get("config")
+        network, _ = load_network(checkpoint, None if config is None else Path(config))
+        height = _checked_height(options.get("lidar_height", MODEL_HEIGHT))
+        write_model(build_graph(network, height - MODEL_HEIGHT), output)
+        own = {
+            "classes": list(network.file.class_names),
+            "nms_iou": network.file.model.post_processing.nms_config.nms_thresh,
+            "nms_across": True,
+        }
+        flags = f"--detector onnx --detector-path {output.resolve()}"
+        return (
+            "in: points [n, 4] float32, x, y, z, intensity in [0, 1] in the LiDAR frame",
+            "out: boxes [k, 7], scores [k] and labels [k], before suppression",
+            f"in curate: {flags} --set 'detector.options={toml(own)}'",
+        )
+
     @property
     def categories(self) -> tuple[str, ...]:
         """The class names of the model file."""
@@ -177,6 +200,13 @@ class OpenPCDetDetector:
                 f"the ground is {max(below, 0):.1f} m below the LiDAR; the detector expects "
                 f"{self._height:g} m: set detector.options.lidar_height = {max(below, 0):.1f}"
             )
+
+
+def _checked_height(metres: object) -> float:
+    """Return the height of the LiDAR, or raise ConfigError."""
+    if isinstance(metres, int | float) and 0 <= metres < 100:
+        return float(metres)
+    raise ConfigError(f"detector.options.lidar_height {metres!r}: expected metres, 0 to 100")
 
 
 def _check_intensities(frame: Frame) -> None:
