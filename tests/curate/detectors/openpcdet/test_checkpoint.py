@@ -4,6 +4,7 @@ import io
 import json
 import pickle
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -190,6 +191,15 @@ def test_a_changed_byte_of_a_weight_is_damage(tmp_path: Path) -> None:
     weight = state_of(path)["backbone_2d.blocks.0.1.weight"].numpy().tobytes()
     content[content.index(weight) + 40] ^= 1
     path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"not a readable checkpoint: damaged"):
+        load_network(path)
+
+
+def test_a_compressed_archive_is_not_unpacked(tmp_path: Path) -> None:
+    """Few bytes could become gigabytes."""
+    path = write_files(tmp_path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(10**6))
     with pytest.raises(ModelError, match=r"not a readable checkpoint: damaged"):
         load_network(path)
 
