@@ -72,9 +72,13 @@ def write(folder: Path, content: Mapping[str, Any]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("places", [5, 17])
 @pytest.mark.parametrize(
-    "vfe", [{}, {"WITH_DISTANCE": True}, {"USE_ABSLOTE_XYZ": False, "NUM_FILTERS": [12, 8]}]
+    ("vfe", "places"),
+    [
+        ({}, 5),
+        ({"WITH_DISTANCE": True}, 17),
+        ({"USE_ABSLOTE_XYZ": False, "NUM_FILTERS": [12, 8]}, 5),
+    ],
 )
 def test_the_exported_model_computes_the_same_for_every_anchor(
     tmp_path: Path, vfe: dict, places: int
