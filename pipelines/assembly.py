@@ -18,6 +18,7 @@ from curate.datasets.frame_names import FrameNames
 from curate.detectors.base import (
     BatchDetector,
     CopiesDetector,
+    DescribesScores,
     Detector,
     TrainableDetector,
     choose_preset,
@@ -156,6 +157,28 @@ def trainer_command(command: str, root: Path) -> UserCommand:
     parsed = UserCommand.parse("train command", command)
     parsed.check(root)
     return parsed
+
+
+def score_meaning(config: Config) -> str | None:
+    """Return what a score of the configured detector estimates; None if that is unknown."""
+    section = config.detector
+    if section.score_meaning or not _is_detector(config, DescribesScores):
+        return section.score_meaning
+    trainable = trainable_detector(config)
+    preset = trainable.preset if trainable else ""
+    with suppress(CurateError):  # a checkpoint that is gone says nothing
+        meaning: str = registry.DETECTORS.load(section.name).score_meaning(
+            preset, section.path, section.options
+        )
+        return meaning
+    return None
+
+
+def describe_score(meaning: str | None) -> str:
+    """Return the predicate of a sentence about the score."""
+    if meaning is None:
+        return "has no known meaning; if you know it, set detector.score_meaning"
+    return f"estimates {meaning}"
 
 
 def runs_elsewhere(config: Config) -> bool:

@@ -22,6 +22,7 @@ from pipelines.commands.doctor import doctor
 from pipelines.commands.evaluate import evaluate
 from pipelines.commands.explain import explain
 from pipelines.commands.export import export
+from pipelines.commands.export_model import export_model
 from pipelines.commands.graph import graph
 from pipelines.commands.init import init
 from pipelines.commands.predict import predict
@@ -53,6 +54,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
         export,
         train_round,
         run,
+        export_model,
     ),
     "Look and ask": (query, explain, view, report, diff, serve, review),
     "Measure": (evaluate, audit, bench),

@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -19,6 +20,9 @@ from curate.weighting.base import ZeroWeight
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
+
+
+_NO_OPTIONS: Mapping[str, Any] = MappingProxyType({})
 
 
 class Detector(Protocol):
@@ -110,6 +114,49 @@ class NamesCategories(Protocol):
 
     def category_names(self) -> Collection[str]:
         """Return all names that its boxes can have."""
+        ...
+
+
+@runtime_checkable
+class DescribesScores(Protocol):
+    """A detector that says what the scores of its boxes estimate."""
+
+    @classmethod
+    def score_meaning(
+        cls, preset: str, checkpoint: Path | None = None, options: Mapping[str, Any] = _NO_OPTIONS
+    ) -> str:
+        """Return what a score estimates, as a noun phrase such as "the 3D IoU with the object".
+
+        Args:
+            preset: name of the network's preset, if there is no checkpoint.
+            checkpoint: the user's checkpoint; it is not loaded if the options say enough.
+            options: `detector.options`.
+
+        Raises:
+            CurateError: if the checkpoint, or a file of the options, cannot be used.
+        """
+        ...
+
+
+@runtime_checkable
+class ExportsOnnx(Protocol):
+    """A detector with a network that can be written as an ONNX model."""
+
+    @classmethod
+    def export_onnx(
+        cls, checkpoint: Path, output: Path, options: Mapping[str, Any]
+    ) -> tuple[str, ...]:
+        """Write a checkpoint as an ONNX model; return its inputs, outputs and use, in lines.
+
+        Args:
+            checkpoint: the checkpoint.
+            output: the file to write.
+            options: `detector.options`.
+
+        Raises:
+            ConfigError: if ONNX has no operators for the network.
+            ModelError: if the checkpoint cannot be used, or the file cannot be written.
+        """
         ...
 
 

@@ -45,6 +45,7 @@ class OnnxDetector:
         sigmoid: whether scores are logits.
         nms_iou: BEV IoU above which the higher-scored box of a category suppresses the other; None
             if the model suppresses boxes itself.
+        nms_across: whether boxes of all categories suppress each other.
         preprocess: `package.module:function` from (n, 4) points to the model's inputs by name.
         postprocess: `package.module:function` from the outputs by name to `boxes`, `scores` and
             `labels` by name.
@@ -73,6 +74,7 @@ class OnnxDetector:
         first_label: int = 0,
         sigmoid: bool = False,
         nms_iou: float | None = None,
+        nms_across: bool = False,
         preprocess: str | None = None,
         postprocess: str | None = None,
         threads: int = 1,
@@ -87,6 +89,7 @@ class OnnxDetector:
         self.first_label = first_label
         self.sigmoid = sigmoid
         self.nms_iou = nms_iou
+        self.nms_across = nms_across
         self._preprocess = _import_function(preprocess) if preprocess else None
         self._postprocess = _import_function(postprocess) if postprocess else None
         self._network = OnnxModel(self.model, threads, "detector", providers, provider_options)
@@ -114,7 +117,7 @@ class OnnxDetector:
         found = self._detections(named)
         found = found.select(np.flatnonzero(found.scores >= self.minimum_score))
         if self.nms_iou is not None:
-            found = _suppress(found, self.nms_iou)
+            found = _suppress(found, self.nms_iou, across=self.nms_across)
         return found.select(np.argsort(-found.scores, kind="stable"))
 
     def _inputs(self, points: np.ndarray) -> Mapping[str, np.ndarray]:
@@ -226,10 +229,11 @@ def _call(function: Callable[[Any], Any], argument: Any, model: Path) -> Mapping
     return result
 
 
-def _suppress(found: Detections, nms_iou: float) -> Detections:
-    """Return the detections that remain after non-maximum suppression per category."""
+def _suppress(found: Detections, nms_iou: float, *, across: bool) -> Detections:
+    """Return the detections that remain after suppression, per category or across them."""
     kept = [np.zeros(0, dtype=np.int64)]
-    for category in np.unique(found.categories):
-        index = np.flatnonzero(found.categories == category)
+    groups = np.zeros(len(found)) if across else found.categories
+    for group in np.unique(groups):
+        index = np.flatnonzero(groups == group)
         kept.append(index[nms_bev(found.boxes[index], found.scores[index], nms_iou)])
     return found.select(np.sort(np.concatenate(kept)))

@@ -18,6 +18,10 @@ _EMPTY_SHARE = 0.5
 _OUTSIDE_LIMIT = 0.1
 # A sweep without a point of at least this intensity was divided by too large a scale.
 _DARK = 0.02
+_MISPLACED = (
+    "lie beside the points: the model has hardly been trained, or for another LiDAR, mounting "
+    "height or range of intensities"
+)
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ def examine_detections(
     found: Detections,
     categories: Sequence[str],
     others: Sequence[tuple[Frame, Detections]] = (),
+    *,
+    trainable: bool = False,
 ) -> list[Finding]:
     """Check the output of a detector.
 
@@ -99,6 +105,8 @@ def examine_detections(
         categories: the configured categories of the workspace.
         others: more frames with their outputs, for the check of the convention: on a straight
             street, many boxes look the same if their yaw is negated.
+        trainable: whether curate trains such a detector: then its convention is curate's, and boxes
+            beside the points have another cause.
     """
     if len(found) == 0:
         return [Finding("detections", "suspect", "the detector finds nothing in this frame")]
@@ -106,9 +114,9 @@ def examine_detections(
     return [
         Finding("detections", "ok", f"{len(found)} boxes, scores {low:.2f} to {high:.2f}"),
         _names(found, categories),
-        _points(frame, found),
+        _points(frame, found, trainable=trainable),
         *([_projections(frame, found)] if frame.cameras else []),
-        _convention([(frame, found), *others]),
+        _convention([(frame, found), *others], trainable=trainable),
     ]
 
 
@@ -124,11 +132,12 @@ def _names(found: Detections, categories: Sequence[str]) -> Finding:
     return Finding("names", "ok", summary)
 
 
-def _points(frame: Frame, found: Detections) -> Finding:
+def _points(frame: Frame, found: Detections, *, trainable: bool) -> Finding:
     empty = int(np.sum(count_points_in_boxes(frame.points, found.boxes) == 0))
     summary = f"{empty} of {len(found)} boxes contain no points"
     if empty == len(found):
-        return Finding("boxes", "wrong", f"{summary}: they are not in the LiDAR frame")
+        cause = f"they {_MISPLACED}" if trainable else "they are not in the LiDAR frame"
+        return Finding("boxes", "wrong", f"{summary}: {cause}")
     return Finding("boxes", "suspect" if empty > len(found) / 2 else "ok", summary)
 
 
@@ -144,7 +153,7 @@ def _projections(frame: Frame, found: Detections) -> Finding:
     return Finding("image", "ok", summary)
 
 
-def _convention(outputs: Sequence[tuple[Frame, Detections]]) -> Finding:
+def _convention(outputs: Sequence[tuple[Frame, Detections]], *, trainable: bool) -> Finding:
     sweeps = []
     for frame, found in outputs:
         top = found.select(np.argsort(-found.scores, kind="stable")[:_TOP_BOXES])
@@ -152,6 +161,8 @@ def _convention(outputs: Sequence[tuple[Frame, Detections]]) -> Finding:
     count = sum(len(each.boxes) for each in sweeps)
     frames = f" of {len(sweeps)} frames" if len(sweeps) > 1 else ""
     where = f"the {count} boxes with the highest scores{frames}"
+    if trainable and suspect_convention(sweeps, labels=False).mistake:
+        return Finding("placement", "suspect", f"{where} {_MISPLACED}")
     return judge_convention("convention", sweeps, where, labels=False)
 
 

@@ -1,15 +1,32 @@
 """A builder that writes ONNX graphs node by node."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from onnx import ModelProto, ValueInfoProto, checker, helper, numpy_helper
 
+from curate.errors import ModelError
+from curate.files.atomic import replace_file
+
 _OPSET = 18  # the first version with a maximum reduction in ScatterND
 _IR_VERSION = 10
 EPSILON = 1e-5
 """The default epsilon of torch's batch norm layers."""
+
+
+def write_model(model: ModelProto, path: Path) -> None:
+    """Write a model, atomically.
+
+    Raises:
+        ModelError: if the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, model.SerializeToString())
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 class GraphBuilder:

@@ -21,7 +21,7 @@ from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, ev
 from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from db import bulk
-from pipelines.assembly import check_executor, open_policy
+from pipelines.assembly import check_executor, describe_score, open_policy, score_meaning
 from pipelines.assessment.audit_folds import open_folds
 from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.engine.plan import Plan
@@ -90,6 +90,7 @@ class AuditedRound:
         figures: the figures of the audit.
         reports: the reports of the stages.
         unmeasured: the names in the request with weights that could not be measured.
+        score_meaning: what a score of the detector estimates; None if unknown.
     """
 
     request: AuditRequest
@@ -97,6 +98,7 @@ class AuditedRound:
     figures: Audit
     reports: tuple[Report, ...]
     unmeasured: tuple[str, ...] = ()
+    score_meaning: str | None = None
 
 
 def run_audit(
@@ -139,7 +141,8 @@ def run_audit(
         replicates=request.replicates,
     )
     unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
-    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured)
+    meaning = score_meaning(workspace.config)
+    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured, meaning)
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
@@ -161,6 +164,8 @@ def describe_audit(found: AuditedRound) -> list[str]:
             + (", ".join(describe_others(found.figures.counts)) or "no objects")
             + ". Check dataset.categories."
         )
+    if "score" in request.names:
+        sentences.append(f"The score {describe_score(found.score_meaning)}.")
     if request.split == "labeled" and not request.folds:
         sentences.append(
             "The thresholds of the point prior were computed from the audited frames, so its "

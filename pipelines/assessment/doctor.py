@@ -29,7 +29,7 @@ from pipelines.assembly import (
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.devices import detector_place, idle_gpu, segmenter_place
-from pipelines.engine.rounds import choose_round, newest_checkpoint
+from pipelines.engine.rounds import choose_round, is_trainable, newest_checkpoint
 from pipelines.labels.of_one_frame import find_frame
 from pipelines.stages.labeled_copies import (
     TURNED,
@@ -149,7 +149,11 @@ def _detector(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
         *_names(detector_differences(config, detector)),
         *([Finding("results", "suspect", missing)] if missing else []),
         *examine_detections(
-            seen, found, config.dataset.categories, _other_results(workspace, detector, frame)
+            seen,
+            found,
+            config.dataset.categories,
+            _other_results(workspace, detector, frame),
+            trainable=is_trainable(workspace),
         ),
     ]
     findings += _headings(workspace, detector)

@@ -112,7 +112,7 @@ def _recorded_config(workspace: Workspace) -> str:
     """
     exclude = {
         "run": {"executor", "workers", "database"},
-        "detector": {"batch_size", "workers", "timeout_s"},
+        "detector": {"batch_size", "workers", "timeout_s", "score_meaning"},
         "segmenter": {"cache", "cache_limit"},
         "train": {"loaders", "processes", "threads"},
     }

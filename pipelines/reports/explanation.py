@@ -17,7 +17,12 @@ from curate.weighting.self_paced import age_parameter, easiness
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import weighted_labels
-from pipelines.assembly import open_prior, open_sequence_source
+from pipelines.assembly import (
+    describe_score,
+    open_prior,
+    open_sequence_source,
+    score_meaning,
+)
 from pipelines.labels.by_frame import check_weights, weighted_round
 from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
@@ -134,6 +139,8 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     recomputed = _weight(label, evidence, age, priors_only=priors_only)
     limit = _limit(workspace, config, label, recomputed)
     lines = _lines(config, label, views, age, evidence, recomputed, limit)
+    meaning = workspace.config.detector.score_meaning or score_meaning(config)
+    lines.insert(1, f"  score          {describe_score(meaning)}")
     recomputed = recomputed if limit is None else limit
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 

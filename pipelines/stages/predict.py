@@ -53,6 +53,7 @@ _WITHOUT_EFFECT = (
     "batch_size",
     "workers",
     "timeout_s",
+    "score_meaning",
     "providers",
     "cache",
     "cache_limit",

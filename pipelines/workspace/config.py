@@ -263,6 +263,12 @@ class DetectorSection(Section):
         description="Category for names that the detector returns; other names stay as they are.",
         examples=[{"car": "Car"}],
     )
+    score_meaning: str | None = Field(
+        default=None,
+        description="What a score of the detector estimates, for explain and audit. Without it, "
+        "what the detector itself says. It changes no result.",
+        examples=["the 3D IoU of the box with the object"],
+    )
     options: Options = Field(
         default={}, description="Further arguments of the detector's class; see docs/detectors.md."
     )

@@ -99,6 +99,7 @@ def test_explain_recomputes_the_weight(curate: Curate, made: Path) -> None:
     assert code == 0
     found = json.loads(out)
     assert found["recomputed"] == pytest.approx(best["weight"])
+    assert found["lines"][1].startswith("  score          has no known meaning")
     assert found["age"]["lambda_u"] == pytest.approx(found["label"]["lambda_u"])
     evidence = {**found["evidence"], **found["evidence"]["rho"]}
     for name in ("loss", "rho_diff", "rho_anno", "rho_det"):

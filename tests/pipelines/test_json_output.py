@@ -55,6 +55,7 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
         "export": there,
         "train-round": there,
         "run": there,
+        "export-model": there,
         "check": there,
         "query": ("SELECT 1e400 AS far, count(*) AS labels FROM weighted_labels", *there),
         "explain": ("FRAME", 0, *there),

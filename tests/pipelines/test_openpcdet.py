@@ -2,15 +2,20 @@
 
 import json
 import pickle
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from support.openpcdet_files import document, write_files
+from support.openpcdet_files import document, random_network, write_files
 from support.pipelines_cli import Curate
 
+from curate.detectors.openpcdet.checkpoint import save_checkpoint
 from curate.errors import ConfigError, FramesFailed, ModelError
+from pipelines.assembly import describe_score, score_meaning
+from pipelines.workspace.config import make_config
 
 # Points have a height of -1.73 m in the toy frames too, so there is nothing to warn of.
 SETTINGS = ("--set", "detector.minimum_score=0.5", "--set", "solve.self_paced=false")
@@ -159,3 +164,62 @@ def test_a_frame_with_wrong_points_fails_alone(
     assert rows[1]["frame"] in failed
     assert rows[0]["frame"] not in failed
     assert err.count("error:") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "meaning"),
+    [
+        ("pillars", {}, "the probability that an object of the category has its centre there"),
+        ("openpcdet", {"preset": "second-small"}, "the probability of the category"),
+        ("openpcdet", {"preset": "voxel-rcnn-small"}, "0 up to an IoU of 0.25, 1 from 0.75"),
+        ("openpcdet", {"config": "SECONDNet"}, "the probability of the category"),
+        ("openpcdet", {"config": "VoxelRCNN"}, "the 3D IoU of the box with the object"),
+        ("openpcdet", {"stored": True}, "the 3D IoU of the box with the object"),
+        ("openpcdet", {"path": "gone.pth"}, None),
+        ("onnx", {"path": "model.onnx"}, None),
+        ("onnx", {"path": "model.onnx", "score_meaning": "a rank"}, "a rank"),
+    ],
+)
+def test_every_detector_says_what_its_score_estimates(
+    tmp_path: Path, name: str, settings: dict, meaning: str | None
+) -> None:
+    """From its preset, model file or checkpoint; unknown where nobody says it."""
+    detector = {"name": name, "score_meaning": settings.get("score_meaning")}
+    if "path" in settings:
+        detector["path"] = tmp_path / settings["path"]
+    if "config" in settings:
+        detector["path"] = write_files(tmp_path, settings["config"])
+        detector["options"] = {"config": str(tmp_path / "model.yaml")}
+    if "stored" in settings:
+        network, detector["path"] = random_network(), tmp_path / "own.pth"
+        save_checkpoint(detector["path"], network, network.state_dict(), "")
+    train = {"preset": settings.get("preset", "auto")}
+    config = make_config(
+        {"dataset": {"root": tmp_path}, "detector": detector, "train": train}, "test"
+    )
+    found = score_meaning(config)
+    assert found == meaning if meaning is None else meaning in str(found)
+    assert describe_score(found).startswith("estimates " if meaning else "has no known meaning")
+
+
+def test_a_model_is_exported_to_onnx(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """The newest checkpoint by default; the printed line uses it, and others say why not."""
+    work = tmp_path / "work"
+    begin(curate, work, toy_kitti, "--detector-path", write_files(tmp_path, "PointPillar"))
+    code, out, err = curate("export-model", "-w", work)
+    assert code == 0, err
+    model = work / "exports" / "model.onnx"
+    assert f"{tmp_path / 'model.pth'} in {model}" in out
+    flags = shlex.split(re.search(r"in curate: (--detector.*)", out)[1])
+    other = tmp_path / "other"
+    code, _, err = curate("init", other, "--root", toy_kitti, "--labeled", "0.25", *flags)
+    assert code == 0, err
+    assert "6 frames done" in curate("predict", "-w", other)[1]
+    code, _, err = curate("export-model", "-w", other)
+    assert (code, err) == (
+        ConfigError.exit_code, "error: detector 'onnx' has no network that curate can export\n"
+    )  # fmt: skip
+    sparse = write_files(tmp_path, "SECONDNet")
+    code, _, err = curate("export-model", "--checkpoint", sparse, "-w", work)
+    assert code == ConfigError.exit_code
+    assert err.startswith("error: SECONDNet cannot be exported: ONNX has no sparse convolution")

@@ -25,7 +25,7 @@ CODE = 7
 _LEAST_SIZE = 1e-5
 # A box is at most 55 times as large as its anchor, and at least 1/55. Only a network that has
 # hardly been trained goes beyond; its boxes would be infinite.
-_MOST_LOG = 4.0
+MOST_LOG = 4.0
 
 
 def make_anchors(file: ModelFile) -> Float32[np.ndarray, "n 7"]:
@@ -101,7 +101,7 @@ def decode(codes: Tensor, anchors: Tensor) -> Tensor:
     diagonal = torch.sqrt(own[..., :1] ** 2 + own[..., 1:2] ** 2)
     scale = torch.cat([diagonal, diagonal, own[..., 2:]], dim=-1)
     centres = codes[..., :3] * scale + anchors[..., :3]
-    sizes = torch.exp(codes[..., 3:6].clamp(-_MOST_LOG, _MOST_LOG)) * own
+    sizes = torch.exp(codes[..., 3:6].clamp(-MOST_LOG, MOST_LOG)) * own
     return torch.cat([centres, sizes, codes[..., 6:] + anchors[..., 6:]], dim=-1)
 
 

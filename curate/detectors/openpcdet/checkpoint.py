@@ -10,13 +10,17 @@ import json
 import pickle
 import struct
 import warnings
+import zipfile
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.serialization import safe_globals
 
 from curate.detectors.openpcdet.network import DetectionNetwork
 from curate.detectors.openpcdet.presets import FORMAT_VERSION
@@ -31,8 +35,9 @@ _MOST_NAMES = 4
 # What torch raises for damaged files.
 _DAMAGED = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError,
-    RuntimeError, TypeError, ValueError, struct.error,
+    RuntimeError, TypeError, ValueError, struct.error, zipfile.BadZipFile,
 )  # fmt: skip
+_UNREADABLE = "not a readable checkpoint: damaged, incomplete, or not written by torch.save"
 
 
 @dataclass(frozen=True)
@@ -136,12 +141,20 @@ def load_weights(
     surplus = [name for name in given if name not in expected]
     if missing or surplus:
         faults = [
-            f"{what} {_listed(names)}"
-            for what, names in (("has no", missing), ("has also", surplus))
+            f"{what} {_listed(_gathered(names, others))}"
+            for what, names, others in (
+                ("has no", missing, given),
+                ("has also", surplus, expected),
+            )
             if names
         ]
         raise ModelError(f"{place}: not a checkpoint of {file}: it {' and '.join(faults)}")
-    wrong = [name for name in given if given[name].shape != expected[name].shape]
+    wrong = [
+        name
+        for name, each in given.items()
+        if (each.shape, each.is_floating_point())
+        != (expected[name].shape, expected[name].is_floating_point())
+    ]
     if wrong:
         shapes = [
             f"{name} {_shape(given[name])} instead of {_shape(expected[name])}" for name in wrong
@@ -181,8 +194,8 @@ def _spconv_2(
 
 def _weights(path: Path, state: Mapping[str, Any]) -> Mapping[str, Tensor]:
     """Return the tensors of a state by name, without `module.` and OpenPCDet's step counter."""
-    names = {name: name.removeprefix("module.") for name in state}
-    weights = {names[name]: each for name, each in state.items() if names[name] != "global_step"}
+    named = {str(name).removeprefix("module."): each for name, each in state.items()}
+    weights = {name: each for name, each in named.items() if name != "global_step"}
     others = [name for name, each in weights.items() if not isinstance(each, Tensor)]
     if others:
         raise ModelError(f"{path}: {_listed(others)} in model_state are not tensors")
@@ -191,8 +204,15 @@ def _weights(path: Path, state: Mapping[str, Any]) -> Mapping[str, Tensor]:
 
 def _content(path: Path) -> Mapping[str, Any]:
     """Return the dictionary in a checkpoint file."""
+    if path.suffix in {".yaml", ".yml"}:
+        raise ModelError(
+            f"{path}: this is a model file, not a checkpoint: give the .pth file as detector.path, "
+            "and this one as detector.options.config"
+        )
     try:
-        with warnings.catch_warnings(action="ignore"):  # of old formats of pickle
+        _check_checksums(path)
+        # The warnings are about old formats.
+        with warnings.catch_warnings(action="ignore"), safe_globals(_numbers()):
             content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise ModelError(f"{path}: no such checkpoint") from None
@@ -202,13 +222,43 @@ def _content(path: Path) -> Mapping[str, Any]:
                 f"{path}: not loaded, because it contains Python code besides weights; save it "
                 "again with only tensors, numbers and strings"
             ) from None
-        raise ModelError(f"{path}: not a readable checkpoint: damaged") from None
-    except _DAMAGED as error:
-        reason = first_line(error)
-        raise ModelError(f"{path}: not a readable checkpoint: {reason:.120}") from None
+        raise ModelError(f"{path}: {_UNREADABLE}") from None
+    except (IsADirectoryError, PermissionError) as error:
+        raise ModelError(f"{path}: not a readable checkpoint: {error.strerror}") from None
+    except _DAMAGED:
+        raise ModelError(f"{path}: {_UNREADABLE}") from None
     if not isinstance(content, dict) or not isinstance(content.get("model_state"), dict):
         raise ModelError(f"{path}: not a checkpoint of OpenPCDet: it has no model_state")
     return content
+
+
+def _numbers() -> list[Any]:
+    """Return what is needed to load numbers of numpy.
+
+    OpenPCDet's learning rate schedules put them into the state of the optimiser.
+    """
+
+    def scalar_of(core: str) -> Any:
+        def scalar(kind: np.dtype, data: bytes) -> Any:
+            return np.frombuffer(data, kind)[0]
+
+        scalar.__module__, scalar.__qualname__ = f"numpy.{core}.multiarray", "scalar"
+        return scalar
+
+    kinds = [type(np.dtype(each)) for each in ("f4", "f8", "i4", "i8", "?")]
+    return [np.dtype, *kinds, scalar_of("core"), scalar_of("_core")]  # of numpy 1 and 2
+
+
+def _check_checksums(path: Path) -> None:
+    """Raise BadZipFile if a part of the file has changed: torch does not compare checksums.
+
+    torch stores the parts as they are. One that is compressed could expand to any size.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            stored = all(each.compress_type == zipfile.ZIP_STORED for each in archive.infolist())
+            if not stored or archive.testzip() is not None:
+                raise zipfile.BadZipFile
 
 
 def _stored_file(path: Path, content: Mapping[str, Any]) -> ModelFile:
@@ -225,7 +275,18 @@ def _is_counter(name: str) -> bool:
 
 
 def _shape(tensor: Tensor) -> str:
-    return "x".join(map(str, tensor.shape)) or "a number"
+    """Return the shape as text, with the type of other numbers than floats."""
+    kind = "" if tensor.is_floating_point() else f" {tensor.dtype}".replace("torch.", "")
+    return ("x".join(map(str, tensor.shape)) or "a number") + kind
+
+
+def _gathered(names: list[str], others: Mapping[str, Tensor]) -> list[str]:
+    """Return the names, with `module.*` in place of several of a module that the others lack."""
+    known = {name.partition(".")[0] for name in others}
+    counts = Counter(name.partition(".")[0] for name in names)
+    whole = {module for module, count in counts.items() if count > 1} - known
+    modules = ((name, name.partition(".")[0]) for name in names)
+    return list(dict.fromkeys(f"{each}.*" if each in whole else name for name, each in modules))
 
 
 def _listed(names: list[str]) -> str:

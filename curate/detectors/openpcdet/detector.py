@@ -1,13 +1,13 @@
 """PointPillar, SECOND and Voxel R-CNN: checkpoints of OpenPCDet, or trained by curate."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from curate.detections import Detections
+from curate.detections import CATEGORIES, Detections
 from curate.detectors.openpcdet.presets import FORMAT_VERSION, PRESETS
 from curate.errors import ConfigError, DataError, first_line
 from curate.files.paths import StrPath
@@ -16,6 +16,7 @@ from curate.geometry.ground import GroundMap
 from curate.warnings_once import warn_once
 
 if TYPE_CHECKING:
+    from curate.detectors.openpcdet.schema import ModelFile
     from curate.detectors.openpcdet.training import AnchorStudent
 
 # Height of KITTI's LiDAR above the ground in metres. The anchors of the public models fit it.
@@ -63,8 +64,7 @@ class OpenPCDetDetector:
 
         from curate.detectors.openpcdet.checkpoint import load_network
 
-        if not 0 <= lidar_height < 100:
-            raise ConfigError(f"detector.options.lidar_height {lidar_height}: give metres")
+        _checked_height(lidar_height)
         network, _ = load_network(Path(checkpoint), None if config is None else Path(config))
         try:
             self._network = network.to(torch.device(device))
@@ -101,6 +101,56 @@ class OpenPCDetDetector:
         from curate.detectors.openpcdet.training import AnchorStudent
 
         return AnchorStudent.load(checkpoint, None if config is None else Path(config))
+
+    @classmethod
+    def score_meaning(
+        cls, preset: str, checkpoint: Path | None = None, options: Mapping[str, Any] | None = None
+    ) -> str:
+        """See `curate.detectors.base.DescribesScores`; Voxel R-CNN learns the overlap of a box."""
+        from curate.detectors.openpcdet.presets import preset_file
+        from curate.detectors.openpcdet.schema import load_model_file
+
+        config = (options or {}).get("config")
+        file: ModelFile | None
+        if checkpoint is None:
+            file = preset_file(preset, CATEGORIES)
+        elif config is not None:
+            file = load_model_file(Path(config))
+        else:
+            from curate.detectors.openpcdet.checkpoint import load_checkpoint
+
+            file = load_checkpoint(checkpoint).file
+        if file is None or file.model.roi_head is None:
+            return "the probability of the category"
+        learned = file.model.roi_head.target_config
+        low, high = learned.cls_bg_thresh, learned.cls_fg_thresh
+        return f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
+
+    @classmethod
+    def export_onnx(
+        cls, checkpoint: Path, output: Path, options: Mapping[str, Any]
+    ) -> tuple[str, ...]:
+        """See `curate.detectors.base.ExportsOnnx`."""
+        from curate.detectors.openpcdet.checkpoint import load_network
+        from curate.detectors.openpcdet.onnx_graph import build_graph
+        from curate.files.onnx_graph import write_model
+        from curate.files.toml_text import toml
+
+        config = options.get("config")
+        network, _ = load_network(checkpoint, None if config is None else Path(config))
+        height = _checked_height(options.get("lidar_height", MODEL_HEIGHT))
+        write_model(build_graph(network, height - MODEL_HEIGHT), output)
+        own = {
+            "classes": list(network.file.class_names),
+            "nms_iou": network.file.model.post_processing.nms_config.nms_thresh,
+            "nms_across": True,
+        }
+        flags = f"--detector onnx --detector-path {output.resolve()}"
+        return (
+            "in: points [n, 4] float32, x, y, z, intensity in [0, 1] in the LiDAR frame",
+            "out: boxes [k, 7], scores [k] and labels [k], before suppression",
+            f"in curate: {flags} --set 'detector.options={toml(own)}'",
+        )
 
     @property
     def categories(self) -> tuple[str, ...]:
@@ -140,11 +190,23 @@ class OpenPCDetDetector:
         if np.isnan(heights).all():
             return
         below = -float(np.nanmedian(heights))
-        if abs(below - self._height) > _TOLERANCE_METRES:
+        if abs(below - self._height) <= _TOLERANCE_METRES:
+            return
+        self._frames = _CHECKED_FRAMES
+        if below < -_TOLERANCE_METRES:
+            warn_once(f"the ground is {-below:.1f} m above the origin of the points: is z up?")
+        else:
             warn_once(
-                f"the ground is {below:.1f} m below the LiDAR; the detector expects "
-                f"{self._height:g} m: set detector.options.lidar_height = {below:.1f}"
+                f"the ground is {max(below, 0):.1f} m below the LiDAR; the detector expects "
+                f"{self._height:g} m: set detector.options.lidar_height = {max(below, 0):.1f}"
             )
+
+
+def _checked_height(metres: object) -> float:
+    """Return the height of the LiDAR, or raise ConfigError."""
+    if isinstance(metres, int | float) and 0 <= metres < 100:
+        return float(metres)
+    raise ConfigError(f"detector.options.lidar_height {metres!r}: expected metres, 0 to 100")
 
 
 def _check_intensities(frame: Frame) -> None:

@@ -9,6 +9,7 @@ from curate.detectors.openpcdet.network import Batch, DetectionNetwork, FirstSta
 from curate.detectors.openpcdet.roi_head import refine
 from curate.detectors.openpcdet.schema import NMS
 from curate.detectors.openpcdet.voxels import make_voxels
+from curate.errors import ModelError
 from curate.geometry.nms import nms_bev
 from curate.geometry.similarity import wrap_angle
 from curate.warnings_once import warn_once
@@ -26,23 +27,30 @@ def detect(
         network: in evaluation mode.
         points: (n, 4) points in the LiDAR frame.
         minimum_score: boxes with a lower score are left out.
-        place: name of the frame, for a warning.
+        place: name of the frame, for messages.
+
+    Raises:
+        ModelError: if an output of the network is NaN or infinite.
     """
     voxels = make_voxels([points], network.file.data_config)
     if len(voxels.counts) == 0:
+        warn_once(
+            "some frames have no points in POINT_CLOUD_RANGE of the model file: they get no boxes"
+        )
         return Detections.empty()
     if voxels.left_out[0]:
         cap = network.file.data_config.voxels.max_number_of_voxels.test
         warn_once(
-            f"frame {place} has {len(voxels.counts) + voxels.left_out[0]} voxels; the model file "
-            f"keeps {cap} (MAX_NUMBER_OF_VOXELS): points beyond them are not seen"
+            f"some frames have more voxels; the model file keeps {cap} (MAX_NUMBER_OF_VOXELS): "
+            "points beyond them are not seen"
         )
     with torch.inference_mode():
         stage = network(Batch.of(voxels, network.anchors.device))
+        _check_finite(place, stage.class_logits, stage.codes)
         if network.file.model.roi_head is None:
             boxes, scores, labels = _first_stage(network, stage, minimum_score)
         else:
-            boxes, scores, labels = _second_stage(network, stage, minimum_score)
+            boxes, scores, labels = _second_stage(network, stage, minimum_score, place)
         found = boxes.double().cpu().numpy()
         confidence = scores.double().cpu().numpy()
         numbers = labels.cpu().numpy()
@@ -82,15 +90,25 @@ def _first_stage(
 
 
 def _second_stage(
-    network: DetectionNetwork, stage: FirstStage, minimum_score: float
+    network: DetectionNetwork, stage: FirstStage, minimum_score: float, place: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return boxes, scores and classes of the refined proposals."""
     rois, classes = proposals(network, stage, 0, network.roi_head.config.nms_config.test)
     frames = torch.zeros(len(rois), dtype=torch.int64, device=rois.device)
     logits, codes = network.roi_head(rois, frames, stage.levels)
+    _check_finite(place, logits, codes)
     scores = torch.sigmoid(logits)
     index = torch.nonzero(scores >= minimum_score)[:, 0]
     return refine(codes[index], rois[index]), scores[index], classes[index]
+
+
+def _check_finite(place: str, *outputs: Tensor) -> None:
+    """Raise ModelError if an output is NaN or infinite: its boxes would silently be left out."""
+    if not all(bool(torch.isfinite(each).all()) for each in outputs):
+        raise ModelError(
+            f"frame {place}: the network computes NaN or infinite values; its weights are damaged, "
+            "or too large"
+        )
 
 
 def _highest(scores: Tensor, most: int) -> Tensor:

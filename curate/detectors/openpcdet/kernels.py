@@ -115,7 +115,10 @@ def near_voxels(
     found = np.full((len(points), most), -1, np.int64)
     squared = np.float32(radius) * np.float32(radius)
     for i in range(len(points)):
-        frame, z, y, x = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3]
+        frame, x = cells[i, 0], cells[i, 3]
+        # The cell of a proposal far away or NaN may be any integer; the sums must not overflow.
+        z = min(max(cells[i, 1], -reach[0] - 1), height + reach[0])
+        y = min(max(cells[i, 2], -reach[1] - 1), depth + reach[1])
         low_y, high_y = max(y - reach[1], 0), min(y + reach[1] + 1, depth)
         count = 0
         for near_z in range(max(z - reach[0], 0), min(z + reach[0] + 1, height)):
@@ -181,4 +184,4 @@ def _iou(a: np.ndarray, b: np.ndarray) -> np.float32:
         return np.float32(0)
     common = width * height
     union = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common
-    return common / max(union, np.float32(1e-6))
+    return np.float32(common / max(union, np.float32(1e-6)))

@@ -10,11 +10,11 @@ One key is curate's own: `BACKBONE_3D.CHANNELS`, the widths of the sparse backbo
 does not let one choose.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from curate.errors import ConfigError, first_line
 from curate.spelling import did_you_mean
@@ -45,11 +45,23 @@ _KITTI_BASE: Mapping[str, Any] = {
     ],
 }
 _MOST_FAULTS = 3
+_COLUMNS = ("x", "y", "z", "intensity")
+# Cells of the map before the 2D backbone; the public models have 35,000 to 300,000.
+_MOST_CELLS = 4096 * 4096
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
+
+
+def _check_columns(names: tuple[str, ...]) -> tuple[str, ...]:
+    if names != _COLUMNS:
+        raise ValueError(f"{', '.join(names)}: curate gives a detector {', '.join(_COLUMNS)}")
+    return names
+
+
+Columns = Annotated[tuple[str, ...], AfterValidator(_check_columns)]
 
 
 class _Section(BaseModel):
@@ -70,8 +82,8 @@ class PointFeatures(_LowerSection):
     """The columns of a point: x, y, z and intensity, as they are."""
 
     encoding_type: Literal["absolute_coordinates_encoding"]
-    used_feature_list: tuple[Literal["x"], Literal["y"], Literal["z"], Literal["intensity"]]
-    src_feature_list: tuple[Literal["x"], Literal["y"], Literal["z"], Literal["intensity"]]
+    used_feature_list: Columns
+    src_feature_list: Columns
 
 
 class Caps(_LowerSection):
@@ -415,9 +427,14 @@ class ModelFile(_Section):
             raise ValueError(f"MAP_TO_BEV.NUM_BEV_FEATURES: these modules give {channels}")
         if self.model.backbone_3d is None and height != 1:
             raise ValueError("VOXEL_SIZE: a pillar is as high as POINT_CLOUD_RANGE")
+        first = 8 if self.model.backbone_3d else 1
+        if across_x * across_y > _MOST_CELLS * first * first:
+            raise ValueError(
+                f"POINT_CLOUD_RANGE, VOXEL_SIZE: {across_x} x {across_y} voxels are too many; "
+                "give metres"
+            )
         strides = {each.feature_map_stride for each in head.anchor_generator_config}
         backbone = self.model.backbone_2d
-        first = 8 if self.model.backbone_3d else 1
         stride = first * backbone.layer_strides[0] // backbone.upsample_strides[0]
         if strides != {stride}:
             raise ValueError(
@@ -483,10 +500,23 @@ def parse_model_file(document: Mapping[str, Any], place: str) -> ModelFile:
     try:
         return ModelFile.model_validate(used)
     except ValidationError as error:
-        faults = error.errors(include_url=False)
+        faults = _innermost(error.errors(include_url=False))
         described = "; ".join(_described(each) for each in faults[:_MOST_FAULTS])
         more = f"; and {len(faults) - _MOST_FAULTS} more" if len(faults) > _MOST_FAULTS else ""
         raise ConfigError(f"{place}: {described}{more}") from None
+
+
+def _innermost(faults: Sequence[Any]) -> list[Any]:
+    """Return the faults without those of a list or section that only follow from one inside."""
+    places = [fault["loc"] for fault in faults]
+    return [
+        fault
+        for fault in faults
+        if not any(
+            len(place) > len(fault["loc"]) and place[: len(fault["loc"])] == fault["loc"]
+            for place in places
+        )
+    ]
 
 
 def _described(fault: Any) -> str:

@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -18,6 +19,9 @@ from safetensors.numpy import save
 from curate.detectors.pillars.presets import PRESETS, Preset
 from curate.errors import ModelError, first_line
 from curate.files.atomic import replace_file
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 FORMAT = "curate-pillars"
 # Version 2 added the IoU estimate, version 3 measures heights from the ground.
@@ -130,14 +134,22 @@ def write_graph(path: Path, checkpoint: Checkpoint, digest: str) -> None:
         ModelError: if the checkpoint lacks tensors, or the graph cannot be written.
     """
     # Deferred import: prediction needs onnx only if the graph is missing.
+    from curate.files.onnx_graph import write_model
+
+    model = graph_of(path, checkpoint)
+    model.metadata_props.add(key=GRAPH_DIGEST, value=digest)
+    write_model(model, graph_path(path))
+
+
+def graph_of(path: Path, checkpoint: Checkpoint) -> "ModelProto":
+    """Return the ONNX graph of the checkpoint at `path`.
+
+    Raises:
+        ModelError: if the checkpoint lacks tensors.
+    """
     from curate.detectors.pillars.onnx_graph import build_graph
 
     try:
-        model = build_graph(checkpoint.weights, checkpoint.preset, len(checkpoint.categories))
+        return build_graph(checkpoint.weights, checkpoint.preset, len(checkpoint.categories))
     except (KeyError, ValueError) as error:
         raise ModelError(f"{path}: damaged checkpoint: {first_line(error)}; train again") from None
-    model.metadata_props.add(key=GRAPH_DIGEST, value=digest)
-    try:
-        replace_file(graph_path(path), model.SerializeToString())
-    except OSError as error:
-        raise ModelError(f"{graph_path(path)}: cannot be written: {error.strerror}") from None

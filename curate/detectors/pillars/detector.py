@@ -1,6 +1,6 @@
 """The trained pillar detector: runs in ONNX Runtime on the CPU and in torch on a GPU."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,6 +14,7 @@ from curate.detectors.pillars.checkpoint import (
     GRAPH_DIGEST,
     Checkpoint,
     digest_of,
+    graph_of,
     graph_path,
     load_checkpoint,
     write_graph,
@@ -119,6 +120,24 @@ class PillarDetector:
     def category_names(self) -> tuple[str, ...]:
         """See `curate.detectors.base.NamesCategories`."""
         return self.categories
+
+    @classmethod
+    def score_meaning(cls, *_: object) -> str:
+        """See `curate.detectors.base.DescribesScores`."""
+        return "the probability that an object of the category has its centre there (heat map)"
+
+    @classmethod
+    def export_onnx(cls, checkpoint: Path, output: Path, _: Mapping[str, Any]) -> tuple[str, ...]:
+        """See `curate.detectors.base.ExportsOnnx`."""
+        from curate.files.onnx_graph import write_model
+
+        loaded = load_checkpoint(checkpoint)
+        write_model(graph_of(checkpoint, loaded), output)
+        return (
+            "in: features and slots, from encode_points in curate.detectors.pillars.encoding",
+            "out: maps of scores, codes and ious, which decode in that module turns into boxes",
+            f"of preset {loaded.preset.name} with categories {', '.join(loaded.categories)}",
+        )
 
     @classmethod
     def batch_size(cls, device: str) -> int:

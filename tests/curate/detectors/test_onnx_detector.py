@@ -119,6 +119,8 @@ def test_nms_can_be_added_to_an_export(path):
     labels = np.array([0, 0, 1])
     assert len(detect(path, rows=rows, labels=labels)) == 3
     assert len(detect(path, {"nms_iou": 0.5}, rows=rows, labels=labels)) == 2
+    across = {"nms_iou": 0.5, "nms_across": True}
+    assert len(detect(path, across, rows=rows, labels=labels)) == 1
 
 
 def test_user_supplied_functions_run_before_and_after_the_model(path):

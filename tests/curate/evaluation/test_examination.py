@@ -114,6 +114,16 @@ def test_sizes_in_another_order_are_reported(order, message):
     assert (finding.state, message in finding.message) == ("wrong", True), finding.message
 
 
+def test_a_detector_that_curate_trains_has_no_other_convention():
+    """Boxes beside the points come from its weights, or from other data than it was trained on."""
+    raised = detections(BOXES - BOXES[:, 5:6] / 2 * [0, 0, 1, 0, 0, 0, 0])
+    found = examine_detections(street(), raised, CATEGORIES, trainable=True)
+    assert (found[-1].check, found[-1].state) == ("placement", "suspect")
+    assert "hardly been trained, or for another LiDAR" in found[-1].message
+    found = examine_detections(street(), detections(BOXES), CATEGORIES, trainable=True)
+    assert {each.state for each in found} == {"ok"}
+
+
 def test_more_frames_decide_where_one_cannot():
     """Boxes along the street look the same if their yaw is negated."""
     straight = BOXES * [1, 1, 1, 1, 1, 1, 0]

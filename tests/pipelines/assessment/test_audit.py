@@ -11,7 +11,13 @@ from support.toys import write_toy_kitti
 
 from curate.errors import ConfigError, FramesFailed, LeakageError, WorkspaceError
 from curate.geometry.overlap import bev_iou
-from pipelines.assessment.audit import EVIDENCE, POLICIES, AuditRequest, run_audit
+from pipelines.assessment.audit import (
+    EVIDENCE,
+    POLICIES,
+    AuditRequest,
+    describe_audit,
+    run_audit,
+)
 from pipelines.assessment.audit_folds import open_folds
 from pipelines.engine.rounds import open_round
 from pipelines.labels.evidence import read_evidence
@@ -45,6 +51,7 @@ def test_val_frames_are_processed_like_unlabeled_frames(workspace: Workspace) ->
     some = found.figures.whole()["pspsl"]
     assert (found.figures.frames, some.labels, some.objects) == (4, 12, 12)
     assert set(found.figures.whole()) == {*POLICIES, *EVIDENCE}
+    assert any(each.startswith("The score has no known meaning") for each in describe_audit(found))
     again, done = audit(workspace)
     assert done == []
     assert again.figures.whole()["pspsl"].auroc == some.auroc

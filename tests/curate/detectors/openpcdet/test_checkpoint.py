@@ -1,10 +1,14 @@
 """Checkpoints: strict loading, both layouts of spconv, and what is rejected."""
 
+import io
 import json
 import pickle
+import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from contracts.samples import assert_one_line
@@ -55,6 +59,28 @@ def test_a_checkpoint_of_curate_has_its_model_file(tmp_path: Path) -> None:
     assert all(map(torch.equal, loaded.state_dict().values(), network.state_dict().values()))
 
 
+@pytest.mark.parametrize("old_format", [True, False])
+@pytest.mark.parametrize("core", [b"numpy.core", b"numpy._core"])
+def test_a_checkpoint_with_the_state_of_openpcdets_optimiser_loads(
+    tmp_path: Path, old_format: bool, core: bytes
+) -> None:
+    """Its schedule computes with numpy; the numbers are pickled as those of numpy 1 or 2."""
+    path = write_files(tmp_path)
+    group = {"lr": np.float64(1e-3), "betas": (np.float32(0.9), 0.99), "step": np.int64(7)}
+    content = {
+        "model_state": state_of(path), "it": 5, "epoch": 80, "version": "pcdet+0.6.0",
+        "optimizer_state": {"state": {0: {"step": 5}}, "param_groups": [group]},
+    }  # fmt: skip
+    expected = load_network(path)[0].state_dict()
+    written = io.BytesIO()
+    torch.save(content, written, _use_new_zipfile_serialization=not old_format)
+    if old_format:  # in the other one, a changed byte would be damage
+        written = io.BytesIO(re.sub(rb"numpy\._?core", core, written.getvalue()))
+    path.write_bytes(written.getvalue())
+    found = load_network(path)[0].state_dict()
+    assert all(torch.equal(each, expected[key]) for key, each in found.items())
+
+
 def drop_head(state: dict) -> None:
     del state["roi_head.cls_pred_layer.bias"]
 
@@ -72,6 +98,11 @@ def fewer_classes(state: dict) -> None:
         state[f"dense_head.conv_cls.{name}"] = state[f"dense_head.conv_cls.{name}"][:2]
 
 
+def other_numbers(state: dict) -> None:
+    name = "backbone_3d.conv_input.0.weight"
+    state[name] = state[name].to(torch.complex64)
+
+
 def not_finite(state: dict) -> None:
     state["dense_head.conv_box.bias"][0] = float("nan")
 
@@ -83,6 +114,8 @@ def not_finite(state: dict) -> None:
         (add_head, "it has also point_head.weight"),
         (widen, "backbone_2d.blocks.0.1.weight 16x16x3x3 instead of 8x16x3x3"),
         (fewer_classes, "the first numbers of dense_head follow from CLASS_NAMES and the anchors"),
+        (other_numbers, "conv_input.0.weight 4x3x3x3x4 complex64 instead of 4x3x3x3x4"),
+        (lambda state: state.update({5: torch.zeros(1)}), "it has also 5"),
         (not_finite, "NaN or infinite weights in dense_head.conv_box.bias"),
         (lambda state: state.update(name="text"), "name in model_state are not tensors"),
     ],
@@ -149,3 +182,29 @@ def test_a_damaged_checkpoint_is_rejected_wherever_it_was_cut(tmp_path: Path) ->
         with pytest.raises(ModelError, match=r"model\.pth: not a readable checkpoint") as caught:
             load_network(path)
         assert_one_line(caught.value)
+
+
+def test_a_changed_byte_of_a_weight_is_damage(tmp_path: Path) -> None:
+    """The checksums of the archive show it; torch does not compare them."""
+    path = write_files(tmp_path)
+    content = bytearray(path.read_bytes())
+    weight = state_of(path)["backbone_2d.blocks.0.1.weight"].numpy().tobytes()
+    content[content.index(weight) + 40] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=r"not a readable checkpoint: damaged"):
+        load_network(path)
+
+
+def test_a_compressed_archive_is_not_unpacked(tmp_path: Path) -> None:
+    """Few bytes could become gigabytes."""
+    path = write_files(tmp_path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(10**6))
+    with pytest.raises(ModelError, match=r"not a readable checkpoint: damaged"):
+        load_network(path)
+
+
+def test_a_model_file_in_place_of_the_checkpoint_is_recognised(tmp_path: Path) -> None:
+    config = write_files(tmp_path).with_suffix(".yaml")
+    with pytest.raises(ModelError, match=r"model\.yaml: this is a model file, not a checkpoint"):
+        load_network(config)

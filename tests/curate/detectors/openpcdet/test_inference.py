@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from curate.detectors.openpcdet.pooling import NearMaximum, near_voxels
 from curate.detectors.openpcdet.roi_head import refine
 from curate.detectors.openpcdet.sparse import Sites
 from curate.detectors.openpcdet.voxels import make_voxels
-from curate.errors import ConfigError, DataError
+from curate.errors import ConfigError, DataError, ModelError
 from curate.frames import Frame, calibration_without_camera
 from curate.geometry.similarity import wrap_angle
 from curate.warnings_once import warn_once
@@ -151,11 +152,43 @@ def test_sweeps_with_hardly_any_points_are_predicted(tmp_path, name: str, count:
     assert (len(found) > 0) == (count > 0)
 
 
-def test_points_outside_the_range_have_no_boxes(tmp_path) -> None:
+def test_points_outside_the_range_have_no_boxes(tmp_path, caplog) -> None:
+    """This is reported once, not for every frame."""
+    warn_once.cache_clear()
     points = sweep()
     points[:, 0] += 1000
     detector = OpenPCDetDetector(write_files(tmp_path), minimum_score=0.0)
-    assert len(detector.predict(frame_of(points))) == 0
+    with caplog.at_level(logging.WARNING):
+        for name in ("1", "2"):
+            assert len(detector.predict(replace(frame_of(points), frame_id=name))) == 0
+    (message,) = caplog.messages
+    assert message.startswith("some frames have no points in POINT_CLOUD_RANGE of the model file")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [1e38, 1e15])
+def test_weights_that_overflow_are_reported(name: str, value: float) -> None:
+    """NaN scores would silently be no boxes, and proposals far away must not crash the pooling."""
+    network = random_network(name)
+    with torch.no_grad():
+        for key, each in network.named_parameters():
+            if key.startswith("dense_head.conv_box") or (value > 1e30 and each.dim() > 1):
+                each.fill_(value)
+    if value > 1e30:
+        with pytest.raises(ModelError, match="frame 7: the network computes NaN or infinite"):
+            detect(network, sweep(), 0.1, "7")
+    else:
+        assert np.isfinite(detect(network, sweep(), 0.1, "7").boxes).all()
+
+
+@pytest.mark.parametrize("cell", [-(2**63), 2**63 - 1, 2**40])
+def test_no_voxel_is_near_a_cell_far_away(cell: int) -> None:
+    """The cell of a coordinate that is NaN or huge can be any integer."""
+    sites, _ = Sites.of(torch.zeros((1, 4), dtype=torch.int64), (4, 9, 8), 1)
+    cells = torch.tensor([[0, cell, 0, 0], [0, 0, cell, 0], [0, 0, 0, cell], [0, cell, cell, cell]])
+    far = torch.full((4, 3), 1e9)
+    near = near_voxels(sites, torch.zeros(1, 3), cells, far, (1, 2, 3), 2.2, 3)
+    assert (near == -1).all()
 
 
 def test_more_voxels_than_the_cap_are_reported(tmp_path, caplog) -> None:
@@ -165,7 +198,9 @@ def test_more_voxels_than_the_cap_are_reported(tmp_path, caplog) -> None:
     config = path.with_suffix(".yaml")
     config.write_text(config.read_text().replace('"test": 40000', '"test": 500'))
     with caplog.at_level(logging.WARNING):
-        found = OpenPCDetDetector(path).predict(frame_of(sweep()))
+        detector = OpenPCDetDetector(path)
+        detector.predict(replace(frame_of(sweep(seed=1)), frame_id="1"))
+        found = detector.predict(frame_of(sweep()))
     assert len(caplog.messages) == 1
     assert "voxels; the model file keeps 500 (MAX_NUMBER_OF_VOXELS)" in caplog.messages[0]
     assert np.isfinite(found.boxes).all()
@@ -198,6 +233,9 @@ def test_the_height_of_the_ground_is_checked_and_can_be_shifted(tmp_path, caplog
         caplog.clear()
         found = OpenPCDetDetector(path, lidar_height=2.73).predict(frame_of(higher))
         assert caplog.messages == []
+        raised = points + np.array([0, 0, 3.4, 0], dtype=np.float32)
+        OpenPCDetDetector(path).predict(frame_of(raised))
+        assert caplog.messages == ["the ground is 1.7 m above the origin of the points: is z up?"]
     assert len(found) == len(expected) > 0
     assert_allclose(found.boxes[:, 2], expected.boxes[:, 2] - 1, atol=1e-3)
     with pytest.raises(ConfigError, match="lidar_height"):

@@ -47,6 +47,16 @@ def test_a_model_file_survives_being_written(name: str) -> None:
         ("MODEL/POST_PROCESSING/NMS_CONFIG/MULTI_CLASSES_NMS", True, "True is not supported"),
         ("MODEL/POST_PROCESSING/SCORE_THRESH", None, "MODEL.POST_PROCESSING.SCORE_THRESH is miss"),
         ("CLASS_NAMES", ["Van"], "has anchors for Car, Pedestrian, Cyclist; CLASS_NAMES are Van"),
+        (
+            "DATA_CONFIG/POINT_FEATURE_ENCODING/used_feature_list",
+            ["x", "y", "z", "intensity", "elongation"],
+            "used_feature_list: x, y, z, intensity, elongation: curate gives a detector x, y, z, i",
+        ),
+        (
+            "DATA_CONFIG/POINT_CLOUD_RANGE",
+            [0, -25600, -3, 51200, 25600, 1],
+            "256000 x 256000 voxels are too many; give metres",
+        ),
         ("DATA_CONFIG/POINT_CLOUD_RANGE", [0, 0, 0, 0, 1, 1], "give x, y, z low, then x, y, z"),
         ("DATA_CONFIG/DATA_PROCESSOR/1/NAME", "sample_points", "'sample_points' is not supported"),
         (
@@ -62,6 +72,15 @@ def test_what_is_not_supported_is_named(path: str, value: object, message: str) 
     assert_one_line(caught.value)
     assert str(caught.value).startswith("model.yaml: ")
     assert message in str(caught.value)
+
+
+def test_a_wrong_number_is_named_alone() -> None:
+    """Without the lists that it is in."""
+    path = "MODEL/DENSE_HEAD/ANCHOR_GENERATOR_CONFIG/0/anchor_sizes"
+    with pytest.raises(ConfigError) as caught:
+        parse_model_file(change(document(), path, [[3.9, 1.6]]), "model.yaml")
+    place = "MODEL.DENSE_HEAD.ANCHOR_GENERATOR_CONFIG.0.anchor_sizes.0.2"
+    assert str(caught.value) == f"model.yaml: {place} is missing"
 
 
 def test_keys_of_training_and_data_preparation_are_accepted() -> None:

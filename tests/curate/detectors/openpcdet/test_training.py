@@ -1,6 +1,9 @@
 """Training: targets, losses and gradients against OpenPCDet's numbers, and the weights v."""
 
+import copy
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +15,8 @@ from support.openpcdet_files import random_network, sweep, write_files
 
 from curate.detections import CATEGORIES
 from curate.detectors.base import Sample
+from curate.detectors.openpcdet import targets as targets_module
+from curate.detectors.openpcdet import training as training_module
 from curate.detectors.openpcdet.anchors import anchor_classes, decode, encode
 from curate.detectors.openpcdet.checkpoint import load_network
 from curate.detectors.openpcdet.inference import detect
@@ -31,8 +36,10 @@ from curate.detectors.openpcdet.targets import (
 )
 from curate.detectors.openpcdet.training import AnchorStudent
 from curate.detectors.openpcdet.voxels import make_voxels
+from curate.detectors.whole_batch import batch_split
 from curate.errors import ConfigError
 from curate.geometry.overlap import bev_iou
+from curate.training.batch_norm import normalise_whole_batches
 
 # Tolerances of the oracle's README.
 LOGITS, TARGETS, LOSSES, GRADIENTS, ENTRIES = 1e-4, 1e-5, 2e-5, 2e-4, 1e-3
@@ -347,6 +354,63 @@ def test_training_repeats_bit_for_bit() -> None:
         terms["loss"].backward()
         results.append([each.grad for each in student.network.parameters()])
     assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
+
+
+class SharedSum:
+    """The sum of a tensor over two threads, which stand for two processes."""
+
+    def __init__(self) -> None:
+        self.own = threading.local()
+        self.parts = [torch.zeros(0), torch.zeros(0)]
+        self.barrier = threading.Barrier(2, timeout=60)
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        self.parts[self.own.rank] = values
+        self.barrier.wait()
+        total = self.parts[0] + self.parts[1]
+        self.barrier.wait()
+        return total
+
+
+@pytest.mark.parametrize("name", ["PointPillar", "SECONDNet", "VoxelRCNN"])
+def test_a_batch_that_is_split_over_processes_has_the_same_loss_and_gradients(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Frames with one, two and no objects, on two processes; proposals are given, not drawn."""
+    rois = torch.tensor([CAR, WALKER, (40.0, 9, -1, 4, 2, 1.5, 0)], dtype=torch.float64)
+    given = (rois + 0.02, torch.tensor([0, 1, 0]))
+    monkeypatch.setattr(training_module, "proposals", lambda *_: given)
+    monkeypatch.setattr(targets_module, "_drawn", np.resize)
+    monkeypatch.setattr(torch, "randperm", torch.arange)
+    frames = [
+        sample([CAR], ["Car"], [0.5]),
+        replace(sample([], [], []), points=sweep(1000, seed=1)),
+        replace(sample([CAR, WALKER], ["Car", "Pedestrian"], [1, 0.25]), points=sweep(seed=2)),
+    ]
+    whole, shared = student_of(name), SharedSum()
+
+    def learn(rank: int | None) -> tuple[dict[str, float], dict[str, torch.Tensor]]:
+        student = copy.deepcopy(whole)
+        normalise_whole_batches(student.network.double())
+        shared.own.rank = rank
+        own = frames if rank is None else (frames[:2], frames[2:])[rank]
+        batch = student.encode(own, "cpu")
+        batch = replace(batch, voxels=replace(batch.voxels, points=batch.voxels.points.double()))
+        terms = student.loss(batch, 1.0)
+        terms["loss"].backward()
+        grads = {key: each.grad for key, each in student.network.named_parameters()}
+        buffers = {key: each for key, each in student.network.named_buffers() if "running" in key}
+        return {key: term.item() for key, term in terms.items()}, grads | buffers
+
+    losses, expected = learn(None)
+    with batch_split(shared), ThreadPoolExecutor(2) as pool:
+        (one, first), (other, second) = pool.map(learn, range(2))
+    for key, value in losses.items():
+        assert one[key] + other[key] == pytest.approx(value, rel=1e-6), key
+        assert value > 0, key
+    for key, value in expected.items():
+        found = first[key] if "running" in key else first[key] + second[key]
+        assert_allclose(found, value, rtol=0, atol=1e-6 * value.abs().max().item(), err_msg=key)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -1,6 +1,7 @@
 """The detector: ONNX Runtime and torch agree, and unusual frames work."""
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 
@@ -211,3 +212,18 @@ def test_the_height_of_the_sensor_does_not_matter(small):
     lower = detector.predict(frame_of((points - [0, 0, 0.5, 0]).astype(np.float32))).select(best)
     np.testing.assert_allclose(lower.scores, found.scores, rtol=1e-3)
     np.testing.assert_allclose(lower.boxes, found.boxes - [0, 0, 0.5, 0, 0, 0, 0], atol=1e-3)
+
+
+def test_the_exported_model_is_the_graph_of_the_checkpoint(small, tmp_path):
+    """In a file of its own, with a description of its inputs and outputs."""
+    output = tmp_path / "folder" / "model.onnx"
+    usage = PillarDetector.export_onnx(small, output, {})
+    assert usage[-1] == "of preset small with categories Car, Pedestrian, Cyclist"
+    checkpoint = load_checkpoint(small)
+    pillars = encode_points(cloud(500), checkpoint.preset)
+    inputs = {"features": pillars.features, "slots": pillars.slots[:, None]}
+    session = onnxruntime.InferenceSession(output)
+    scores, codes, ious = session.run(["scores", "codes", "ious"], inputs)
+    [expected] = onnx_forward(small, checkpoint, 1)([pillars])
+    for found, wanted in zip((scores, codes, ious[..., 0]), expected, strict=True):
+        np.testing.assert_array_equal(found, wanted)
