@@ -124,7 +124,12 @@ class OpenPCDetDetector:
             return "the probability of the category"
         learned = file.model.roi_head.target_config
         low, high = learned.cls_bg_thresh, learned.cls_fg_thresh
-        return f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
+        overlap = (
+            f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
+        )
+        if file.model.roi_head.score == "both":
+            return f"the geometric mean of the probability of the category and of {overlap}"
+        return overlap
 
     @classmethod
     def export_onnx(

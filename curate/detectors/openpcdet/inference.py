@@ -63,8 +63,8 @@ def detect(
 
 def proposals(
     network: DetectionNetwork, stage: FirstStage, frame: int, config: NMS
-) -> tuple[Tensor, Tensor]:
-    """Return the (r, 7) proposals of a frame and their (r,) classes, by descending score.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the (r, 7) proposals of a frame, their (r,) classes and logits, by descending logit.
 
     OpenPCDet fills up to the full number with boxes of size 0 at the origin; curate does not.
     """
@@ -74,7 +74,8 @@ def proposals(
     rows = boxes.double().cpu().numpy()
     kept = torch.from_numpy(_suppressed(rows, logits[index].double().cpu().numpy(), config))
     kept = kept.to(index.device)
-    return boxes[kept], classes[index[kept]]
+    best = index[kept]
+    return boxes[kept], classes[best], logits[best]
 
 
 def _first_stage(
@@ -92,12 +93,19 @@ def _first_stage(
 def _second_stage(
     network: DetectionNetwork, stage: FirstStage, minimum_score: float, place: str
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return boxes, scores and classes of the refined proposals."""
-    rois, classes = proposals(network, stage, 0, network.roi_head.config.nms_config.test)
+    """Return boxes, scores and classes of the refined proposals.
+
+    The published score is that of the second stage, an estimate of the 3D IoU. After a short
+    training it is too high for proposals on background, of which it has seen few. The score "both"
+    is the geometric mean with the probability of the first stage.
+    """
+    rois, classes, first = proposals(network, stage, 0, network.roi_head.config.nms_config.test)
     frames = torch.zeros(len(rois), dtype=torch.int64, device=rois.device)
     logits, codes = network.roi_head(rois, frames, stage.levels)
     _check_finite(place, logits, codes)
     scores = torch.sigmoid(logits)
+    if network.roi_head.config.score == "both":
+        scores = (scores * torch.sigmoid(first)).sqrt()
     index = torch.nonzero(scores >= minimum_score)[:, 0]
     return refine(codes[index], rois[index]), scores[index], classes[index]
 

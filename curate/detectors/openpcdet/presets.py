@@ -246,6 +246,7 @@ def _roi_head(preset: Preset) -> dict[str, Any]:
         "CLS_FC": [shared, shared],
         "REG_FC": [shared, shared],
         "DP_RATIO": 0.3,
+        "SCORE": "both" if preset.small else "roi",
         "NMS_CONFIG": {
             "TRAIN": {
                 **_NMS, "NMS_PRE_MAXSIZE": most, "NMS_POST_MAXSIZE": kept, "NMS_THRESH": 0.8

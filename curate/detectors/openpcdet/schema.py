@@ -347,7 +347,10 @@ class RoILoss(_Section):
 
 
 class VoxelRCNNHead(_Section):
-    """The second stage of Voxel R-CNN."""
+    """The second stage of Voxel R-CNN.
+
+    `score` is a key of curate: "both" multiplies the scores of both stages, see `inference`.
+    """
 
     name: Literal["VoxelRCNNHead"]
     class_agnostic: Literal[True]
@@ -355,6 +358,7 @@ class VoxelRCNNHead(_Section):
     cls_fc: tuple[Count, ...] = Field(min_length=1)
     reg_fc: tuple[Count, ...] = Field(min_length=1)
     dp_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    score: Literal["roi", "both"] = "roi"
     nms_config: ProposalNMS
     roi_grid_pool: GridPool
     target_config: ProposalSampling

@@ -126,8 +126,10 @@ class AnchorStudent:
         sampled = []
         with torch.no_grad():
             for frame, each in enumerate(objects):
-                rois = proposals(self.network, stage, frame, head.config.nms_config.train)
-                sampled.append(sample_rois(*rois, frame, each, head.config.target_config))
+                rois, classes, _ = proposals(
+                    self.network, stage, frame, head.config.nms_config.train
+                )
+                sampled.append(sample_rois(rois, classes, frame, each, head.config.target_config))
         targets = joined(sampled)
         logits, codes = head(targets.rois, targets.frames, stage.levels)
         return roi_loss(logits, codes, targets, head.config)

@@ -112,7 +112,7 @@ def check_anchors(network, stage, expected) -> None:
 
 def check_second_stage(network, stage, expected) -> None:
     """Check proposals, pooled features, scores and refined boxes."""
-    found, classes = proposals(network, stage, 0, network.roi_head.config.nms_config.test)
+    found, classes, _ = proposals(network, stage, 0, network.roi_head.config.nms_config.test)
     rois = torch.from_numpy(expected["rois"])
     pairs = [(found - roi).abs().amax(dim=1).min() for roi in rois]
     assert len(found) == len(rois)
@@ -298,3 +298,20 @@ def test_predictions_repeat_bit_for_bit(name: str) -> None:
     one, other = (detect(network, sweep(), 0.05, "x") for _ in range(2))
     assert np.array_equal(one.boxes, other.boxes)
     assert np.array_equal(one.scores, other.scores)
+
+
+def test_the_score_of_both_stages_is_their_geometric_mean(monkeypatch) -> None:
+    """The boxes are those of the published rule; only their scores and suppression differ."""
+    network = random_network("VoxelRCNN")
+    made = make_voxels([sweep()], network.file.data_config)
+    head = network.roi_head
+    with torch.inference_mode():
+        stage = network(Batch.of(made))
+        rois, _, first = proposals(network, stage, 0, head.config.nms_config.test)
+        second, _ = head(rois, torch.zeros(len(rois), dtype=torch.int64), stage.levels)
+    expected = (first.double().sigmoid() * second.double().sigmoid()).sqrt()
+    monkeypatch.setattr(head, "config", head.config.model_copy(update={"score": "both"}))
+    found = detect(network, sweep(), 0.0, "x").scores
+    assert len(found) > 5
+    assert_allclose(found[0], expected.max(), atol=1e-6)
+    assert (np.abs(found[:, None] - expected.numpy()).min(axis=1) < 1e-6).all()
