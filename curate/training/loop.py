@@ -21,6 +21,7 @@ from torch import Tensor, distributed, nn
 from curate.detectors.base import Student
 from curate.detectors.precision import mixed_precision
 from curate.detectors.whole_batch import batch_split, whole_batch_sum
+from curate.errors import ModelError
 from curate.training.batch_norm import normalise_whole_batches
 from curate.training.batches import Batches
 from curate.training.labels import WeightedLabels
@@ -142,6 +143,7 @@ def run_steps(job: TrainingJob, place: Place, report: Report) -> None:
 
     Raises:
         DataError: if a frame cannot be read.
+        ModelError: if the loss is not finite.
     """
     settings = job.settings
     torch.set_num_threads(settings.threads)
@@ -173,7 +175,7 @@ def run_steps(job: TrainingJob, place: Place, report: Report) -> None:
         for step, batch in zip(steps, loaded, strict=True):
             terms = partial(loss, batch, expected)
             values = _train_step(job, place, terms, optimizer, scaler, step)
-            losses = [*losses[1 - _RECENT_STEPS :], float(values["loss"])]
+            losses = [*losses[1 - _RECENT_STEPS :], _finite(float(values["loss"]), step)]
             if (step + 1) % settings.statistics_steps == 0 or step + 1 == settings.steps:
                 statistics += [
                     Statistic(step + 1, name, float(value)) for name, value in values.items()
@@ -193,6 +195,20 @@ def run_steps(job: TrainingJob, place: Place, report: Report) -> None:
                 saved = time.monotonic()
     weights = {name: tensor.cpu() for name, tensor in networks[-1].state_dict().items()}
     report(Trained(weights, sum(losses) / len(losses), tuple(statistics)))
+
+
+def _finite(loss: float, step: int) -> float:
+    """Return the loss of a step.
+
+    Raises:
+        ModelError: if it is NaN or infinite, because all further steps would be too.
+    """
+    if not math.isfinite(loss):
+        raise ModelError(
+            f"the loss of step {step + 1} is {loss}: the training has diverged; lower "
+            "train.learning_rate (train.round_learning_rate in rounds)"
+        )
+    return loss
 
 
 def one_cycle(step: int, steps: int, peak: float) -> float:

@@ -241,6 +241,13 @@ def test_frames_that_do_not_fit_into_memory_are_read_again(make_labels, tiny):
     assert torch.equal(with_room.targets.heatmap, without.targets.heatmap)
 
 
+def test_a_training_that_diverges_ends_at_once(make_labels, tiny, tmp_path):
+    """No checkpoint of useless weights is written."""
+    with pytest.raises(ModelError, match=r"the loss of step \d+ is (nan|inf): .*learning_rate"):
+        train(make_labels(labeled=2), tmp_path / "out.safetensors", quick(tiny, learning_rate=1e30))
+    assert not (tmp_path / "out.safetensors").exists()
+
+
 def test_training_needs_labeled_frames(make_labels, tiny, tmp_path):
     """A label file with pseudo-labels only is rejected."""
     with pytest.raises(DataError, match="no labeled frame"):
