@@ -28,17 +28,15 @@ from curate.errors import ConfigError, one_line
 from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
 from curate.files.toml_text import parse_toml
+from curate.ranges import AtLeastOne, Count, Share
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownDevice, KnownName, KnownProvider
 
-Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Scale = Annotated[float, Field(gt=0, le=100)]
 Overlaps = dict[str, Annotated[float, Field(gt=0, lt=1)]]
-AtLeastOne = Annotated[int, Field(ge=1)]
-Count = Annotated[int, Field(ge=0)]
 PointCount = Annotated[float, Field(ge=1, allow_inf_nan=False)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]

@@ -161,6 +161,17 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
         ("run.method=no_such_package:X", "run.method: policy 'no_such_package:X' cannot be"),
         ("solve.options.pspsl.scoop=1", "policy 'pspsl' has no option 'scoop'; did you mean 'scop"),
         ("segmenter.name=no_such_package:X", "segmenter.name: segmenter 'no_such_package:X' cann"),
+        (
+            "detector.options.nms_iou=2",
+            "option nms_iou = 2 should be less than or equal to 1",
+        ),
+        ("detector.options.threads=0", "option threads = 0 should be greater than or equal to 1"),
+        ("run.executor_options.auto.workers=0.5", "option workers = 0.5 should be a valid integer"),
+        (
+            "solve.options.pspsl.scope=7",
+            "option scope = 7 should be 'round', 'category' or",
+        ),
+        ("dataset.options.camera='left'", 'option camera = "left" should be a valid integer'),
         ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
     ],
 )
