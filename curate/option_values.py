@@ -87,7 +87,7 @@ def _keys(location: Sequence[int | str], value: Any) -> tuple[int | str, ...]:
 
 def _expected(message: str) -> str:
     """Return what pydantic expects, in the words of TOML: "Input should be an object"."""
-    words = message.partition(" should ")[2] or message
+    words = message.partition(" should ")[2] or "have more entries"  # "Field required", in a tuple
     return words.replace("an object", "a table").replace("a valid array", "a list")
 
 

@@ -27,12 +27,14 @@ from curate.exporters.base import DataToExport, Selective
 from curate.files.onnx_providers import CPU
 from curate.files.toml_text import toml_key
 from curate.frames import Calibration
+from curate.option_values import describe_wrong_values
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
 from curate.segmenters.base import DeclaresClasses, Segmenter
 from curate.segmenters.map_store import MapStore, StoringSegmenter
 from curate.segmenters.renamed import RenamedSegmenter, renamed_classes
+from curate.spelling import did_you_mean
 from curate.weighting.base import Policy
 from pipelines import registry
 from pipelines.devices import (
@@ -41,7 +43,7 @@ from pipelines.devices import (
     check_segmenter_place,
     detector_place,
 )
-from pipelines.workspace.config import Config
+from pipelines.workspace.config import Config, TrainSection
 from pipelines.workspace.workspace import open_dataset, sha256
 
 Kind = TypeVar("Kind")
@@ -464,6 +466,30 @@ def check_labels_format(config: Config, dataset: Dataset | None = None) -> None:
                 exporter.check_data(DataToExport(frame, images, config.dataset.categories))
 
 
+def check_training_options(config: Config) -> None:
+    """Check the further settings of curate's trainer.
+
+    Raises:
+        ConfigError: if the trainer does not have one of them, or its value is wrong.
+    """
+    options = config.train.options
+    if not options:
+        return
+    from curate.training.settings import TrainingSettings
+
+    accepted = [field.name for field in dataclasses.fields(TrainingSettings)]
+    unknown = [name for name in options if name not in accepted]
+    if unknown:
+        elsewhere = {*TrainSection.model_fields, "steps", "seed", "device"}
+        names = [name for name in accepted if name not in elsewhere]
+        raise ConfigError(
+            f"train.options of curate.toml: unknown setting '{unknown[0]}'"
+            f"{did_you_mean(unknown[0], names)}; it accepts {', '.join(names)}"
+        )
+    if wrong := describe_wrong_values(TrainingSettings, options):
+        raise ConfigError(f"train.options.{wrong}")
+
+
 def check_extensions(config: Config) -> None:
     """Check every class that the configuration refers to, without loading a model.
 
@@ -475,6 +501,7 @@ def check_extensions(config: Config) -> None:
     check_policy(config, config.run.method)
     check_executor(config)
     check_labels_format(config)
+    check_training_options(config)
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:

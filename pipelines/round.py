@@ -31,6 +31,7 @@ _FIRST = (
         settings=pretrain.settings,
         run=pretrain.run,
         file=pretrain.file,
+        check=pretrain.check,
         guard=pretrain.guard,
     ),
 )

@@ -131,12 +131,14 @@ class FirstStage(_Stage):
         settings: function that returns everything that the result depends on.
         run: function that does the work.
         file: function that returns the path of the file it writes.
+        check: check of its settings before any work; raises an error.
         guard: check at every start, even if the stage is up to date; raises LeakageError.
     """
 
     settings: Callable[[Workspace], Any]
     run: Callable[[Workspace, Progress], Product]
     file: Callable[[Workspace], Path]
+    check: Callable[[Workspace], None]
     guard: Callable[[Workspace], None]
 
 

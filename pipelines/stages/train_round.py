@@ -1,6 +1,6 @@
 """train-round: train the student from the exported labels and the teacher."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,14 +10,14 @@ from sqlalchemy import Connection
 from curate.datasets.base import Dataset
 from curate.detectors.devices import AUTO, choose_device
 from curate.detectors.precision import FLOAT32
-from curate.errors import ConfigError, one_line
+from curate.errors import ConfigError
 from curate.files.onnx_providers import CPU
 from curate.frames import Frame
-from curate.spelling import did_you_mean
 from db import bulk
 from pipelines.assembly import (
     check_labels_format,
     check_policy,
+    check_training_options,
     trainable_detector,
     trained_detector,
 )
@@ -206,8 +206,9 @@ def training_settings(
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
+    check_training_options(workspace.config)
     device = choose_device(workspace.config.detector.device)
-    values = {
+    values: dict[str, Any] = {
         "preset": trained_detector(workspace.config).preset,
         "steps": steps,
         "batch_size": section.batch_size,
@@ -224,16 +225,7 @@ def training_settings(
         "loaders": loaders(section, device),
         "precision": section.precision,
     }
-    try:
-        return TrainingSettings(**{**values, **section.options})
-    except TypeError as error:
-        names = [field.name for field in fields(TrainingSettings) if field.name not in values]
-        unknown = [name for name in section.options if name not in {*names, *values}]
-        reason = f"unknown setting '{unknown[0]}'" if unknown else one_line(error)
-        meant = did_you_mean(unknown[0], names) if unknown else ""
-        raise ConfigError(
-            f"train.options of curate.toml: {reason}{meant}; it accepts {', '.join(names)}"
-        ) from None
+    return TrainingSettings(**{**values, **section.options})
 
 
 def train_with_progress(
