@@ -27,7 +27,7 @@ from curate.detectors.precision import Precision
 from curate.errors import ConfigError, one_line
 from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
-from curate.files.toml_text import parse_toml
+from curate.files.toml_text import parse_toml, toml
 from curate.ranges import AtLeastOne, Count, Share
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
@@ -49,14 +49,6 @@ PolicyName = Annotated[str, KnownName(registry.POLICIES)]
 ExporterName = Annotated[str, KnownName(registry.EXPORTERS)]
 ExecutorName = Annotated[str, KnownName(registry.EXECUTORS)]
 ProviderName = Annotated[str, KnownProvider()]
-ProviderTable = Annotated[
-    dict[ProviderName, Options] | None,
-    Field(
-        description="Options of the providers by their names.",
-        examples=[{"cuda": {"device_id": 1}}],
-    ),
-]
-
 DEFAULT_PRIORS = ("points", "semantic")
 
 
@@ -111,6 +103,26 @@ ProviderNames = Annotated[
     Annotated[tuple[ProviderName, ...], Field(min_length=1), AfterValidator(_each_once)]
     | Literal["auto"],
     BeforeValidator(_as_list),
+]
+
+
+def _plain_options(options: dict[str, dict[str, Any]] | None) -> dict[str, dict[str, Any]] | None:
+    for provider, values in (options or {}).items():
+        for key, value in values.items():
+            if not isinstance(value, str | int | float):
+                raise ValueError(  # noqa: TRY004 - pydantic collects ValueError
+                    f"{provider}.{key} = {toml(value)}: use a string, a number, true or false"
+                )
+    return options
+
+
+ProviderTable = Annotated[
+    dict[ProviderName, Options] | None,
+    AfterValidator(_plain_options),
+    Field(
+        description="Options of the providers by their names.",
+        examples=[{"cuda": {"device_id": 1}}],
+    ),
 ]
 
 
