@@ -223,8 +223,12 @@ def _calibrations(config: Config) -> Callable[[str], Calibration]:
     return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
-def open_segmenter(config: Config) -> Segmenter:
+def open_segmenter(config: Config, store: MapStore | None = None) -> Segmenter:
     """Return the segmenter; it reads and writes the stored maps if its maps can be stored.
+
+    Args:
+        config: the configuration.
+        store: the folder of the maps, if it is open.
 
     Raises:
         ConfigError: if no segmenter is configured, or a setting is missing or wrong.
@@ -251,7 +255,9 @@ def open_segmenter(config: Config) -> Segmenter:
     if isinstance(segmenter, DeclaresClasses):
         _check_classes(config, segmenter.classes)
     if stores_maps(config):
-        segmenter = StoringSegmenter(segmenter, open_map_store(config), open_dataset(config))
+        segmenter = StoringSegmenter(
+            segmenter, store or open_map_store(config), open_dataset(config)
+        )
     return RenamedSegmenter(segmenter, section.rename) if section.rename else segmenter
 
 

@@ -182,7 +182,8 @@ class CacheStage(_FramesStage):
     only frames that one of its readers will read.
 
     Attributes:
-        function: function that returns what the stage does with a frame; it returns no rows.
+        function: function that returns what the stage does with a frame. That returns an entry for
+            what was stored; without one, the frame is not done.
         refusal: function that returns a function, which returns why nothing further can be stored;
             "" if it can. The stage then ends early.
         exists: function that returns whether the folder of what it stored is there.
