@@ -9,8 +9,8 @@ from sqlalchemy import Connection
 
 from curate.datasets.base import Dataset
 from curate.detectors.devices import AUTO, choose_device
-from curate.detectors.precision import FLOAT32
-from curate.errors import ConfigError
+from curate.detectors.precision import FLOAT32, mixed_precision
+from curate.errors import ConfigError, error_prefix
 from curate.files.onnx_providers import CPU
 from curate.frames import Frame
 from db import bulk
@@ -201,13 +201,16 @@ def training_settings(
 
     Raises:
         ConfigError: if `train.options` has a setting that the trainer does not have, or a wrong
-            value.
+            value, or the device does not have the precision.
     """
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
     check_training_options(workspace.config)
     device = choose_device(workspace.config.detector.device)
+    if section.precision != FLOAT32:
+        with error_prefix("train.precision"):
+            mixed_precision(section.precision, device)
     values: dict[str, Any] = {
         "preset": trained_detector(workspace.config).preset,
         "steps": steps,

@@ -1,6 +1,7 @@
 """Where models run: device and providers of the configuration, on machines that are not here."""
 
 import threading
+import warnings
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from support.pipelines_cli import Curate
 from support.tiny_onnx import tiny_detector
 
 from curate.detectors.devices import check_device_name, choose_device
+from curate.detectors.precision import mixed_precision
 from curate.errors import ConfigError, DataError
 from curate.warnings_once import warn_once
 from pipelines.assembly import check_detector, check_segmenter, made_by, open_detector
@@ -259,6 +261,26 @@ def test_a_mixed_precision_needs_a_detector_in_torch(gpu, tmp_path):
         section = {"path": str(tmp_path), "precision": "bfloat16", **other}
         with pytest.raises(ConfigError, match=r"detector\.precision: .*remove the setting"):
             check_detector(config(detector=section))
+
+
+def test_float16_on_the_cpu_is_reported_once(caplog, gpu):
+    """It is many times slower; bfloat16 is not."""
+    warn_once.cache_clear()
+    for precision in ("bfloat16", "float16", "float16"):
+        check_detector(config(detector={"device": "cpu", "precision": precision}))
+    [message] = caplog.messages
+    assert message.startswith("precision 'float16' is many times slower than 'float32' on the CPU")
+
+
+def test_a_precision_that_torch_would_not_use_is_an_error(monkeypatch):
+    """Torch itself warns and computes in float32."""
+
+    def autocast(kind, dtype):
+        warnings.warn(f"In {kind} autocast, but the target dtype is not supported", stacklevel=1)
+
+    monkeypatch.setattr(torch, "autocast", autocast)
+    with pytest.raises(ConfigError, match="precision 'bfloat16' cannot be used on mps: In mps"):
+        mixed_precision("bfloat16", "mps")
 
 
 def test_a_precision_is_part_of_what_results_depend_on():
