@@ -168,7 +168,8 @@ def undecided_labels(connection: Connection, names: Sequence[str]) -> TextualSel
     """Return the query for the rows of `weighted_labels` of some frames without human decisions.
 
     It reads the tables behind part 1 of the view in the order of their key: half the time of the
-    view, which sorts by the name of the frame and looks up a decision for each label.
+    view, which sorts by the name of the frame and looks up a decision for each label. The order is
+    that of the weights, the first table: SQLite would sort the rows by the k of another table.
 
     Args:
         connection: connection to the database.
@@ -182,14 +183,14 @@ def undecided_labels(connection: Connection, names: Sequence[str]) -> TextualSel
     kinds = {column.name: column.kind for column in label_columns(read_declarations(connection))}
     query = text(f"""
         SELECT {", ".join(f'"{name}"' for name in names)} FROM (
-            SELECT w.frame_id AS frame_id, p.round AS round, f.frame AS frame, {_PREDICTED},
+            SELECT w.frame_id, w.k AS weight_k, p.round AS round, f.frame AS frame, {_PREDICTED},
                    'detector' AS provenance, w.policy AS policy, w.v AS weight{stored}
             FROM weight AS w CROSS JOIN prediction AS p CROSS JOIN frame AS f
             {evidence}
             WHERE w.round = :round AND w.policy = :policy AND w.frame_id IN :frames
               AND p.round = w.round AND p.frame_id = w.frame_id AND p.k = w.k
               AND f.id = w.frame_id
-        ) AS labels ORDER BY frame_id, k
+        ) AS labels ORDER BY frame_id, weight_k
     """)  # noqa: S608 - composed of constants and declared columns
     return query.bindparams(bindparam("frames", expanding=True)).columns(
         *(column(name, _TYPES[kinds[name]]) for name in names)

@@ -38,6 +38,7 @@ _PAGE = re.compile(r"\bdocs/([a-z]+\.md)")
 _SHORT_TYPES = (
     (r"<class '([^']*)'>", r"\1"),
     (r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z_])", ""),
+    (r"Annotated\[(\w+)(?:, \w+\(\w+=[^)]*\))+\]", r"\1"),
     (r"\b(\w+)\[(ndarray|Tensor), '([^']*)'\]", r'\1[\2, "\3"]'),
 )
 _QUERIES = """\

@@ -29,6 +29,7 @@ from curate.files.onnx_providers import CPU
 from curate.files.toml_text import toml_key
 from curate.files.user_command import UserCommand, fill, placeholders
 from curate.frames import Calibration
+from curate.option_values import describe_wrong_values
 from curate.priors.base import EvidenceSource, SequenceSource
 from curate.priors.points import PointSettings
 from curate.priors.semantic import SemanticSettings
@@ -44,7 +45,7 @@ from pipelines.devices import (
     check_segmenter_place,
     detector_place,
 )
-from pipelines.workspace.config import Config
+from pipelines.workspace.config import Config, TrainSection
 from pipelines.workspace.workspace import open_dataset, sha256
 
 Kind = TypeVar("Kind")
@@ -278,8 +279,12 @@ def _calibrations(config: Config) -> Callable[[str], Calibration]:
     return lambda frame_id: dataset.read(frame_id, points=False).calibration
 
 
-def open_segmenter(config: Config) -> Segmenter:
+def open_segmenter(config: Config, store: MapStore | None = None) -> Segmenter:
     """Return the segmenter; it reads and writes the stored maps if its maps can be stored.
+
+    Args:
+        config: the configuration.
+        store: the folder of the maps, if it is open.
 
     Raises:
         ConfigError: if no segmenter is configured, or a setting is missing or wrong.
@@ -306,7 +311,9 @@ def open_segmenter(config: Config) -> Segmenter:
     if isinstance(segmenter, DeclaresClasses):
         _check_classes(config, segmenter.classes)
     if stores_maps(config):
-        segmenter = StoringSegmenter(segmenter, open_map_store(config), open_dataset(config))
+        segmenter = StoringSegmenter(
+            segmenter, store or open_map_store(config), open_dataset(config)
+        )
     return RenamedSegmenter(segmenter, section.rename) if section.rename else segmenter
 
 
@@ -521,6 +528,30 @@ def check_labels_format(config: Config, dataset: Dataset | None = None) -> None:
                 exporter.check_data(DataToExport(frame, images, config.dataset.categories))
 
 
+def check_training_options(config: Config) -> None:
+    """Check the further settings of curate's trainer.
+
+    Raises:
+        ConfigError: if the trainer does not have one of them, or its value is wrong.
+    """
+    options = config.train.options
+    if not options:
+        return
+    from curate.training.settings import TrainingSettings
+
+    accepted = [field.name for field in dataclasses.fields(TrainingSettings)]
+    unknown = [name for name in options if name not in accepted]
+    if unknown:
+        elsewhere = {*TrainSection.model_fields, "steps", "seed", "device"}
+        names = [name for name in accepted if name not in elsewhere]
+        raise ConfigError(
+            f"train.options of curate.toml: unknown setting '{unknown[0]}'"
+            f"{did_you_mean(unknown[0], names)}; it accepts {', '.join(names)}"
+        )
+    if wrong := describe_wrong_values(TrainingSettings, options):
+        raise ConfigError(f"train.options.{wrong}")
+
+
 def check_extensions(config: Config, root: Path) -> None:
     """Check every class and command of the configuration, without loading a model.
 
@@ -539,6 +570,7 @@ def check_extensions(config: Config, root: Path) -> None:
     check_policy(config, config.run.method)
     check_executor(config)
     check_labels_format(config)
+    check_training_options(config)
 
 
 def consistency_settings(config: Config) -> ConsistencySettings:

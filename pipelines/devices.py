@@ -18,12 +18,16 @@ from curate.files.onnx_providers import (
     CPU,
     ProviderOptions,
     Providers,
+    ignored_options,
     is_exclusive,
     providers_of_device,
     requested_providers,
 )
+from curate.warnings_once import warn_once
 from pipelines import registry
 from pipelines.workspace.config import Config
+
+_NOT_IN_RUNTIME = "the configured class does not run in ONNX Runtime; remove the setting"
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,8 @@ def check_detector_place(config: Config) -> None:
     setting = "device" if section.providers == AUTO else "providers"
     with error_prefix(f"detector.{setting}"):
         _check_providers(place, section.providers)
+    with error_prefix("detector.provider_options"):
+        _check_options("detector", place, section.provider_options or {})
 
 
 def check_segmenter_place(config: Config) -> None:
@@ -122,8 +128,28 @@ def check_segmenter_place(config: Config) -> None:
     Raises:
         ConfigError: if a listed provider cannot be used, or has no effect.
     """
+    section, place = config.segmenter, segmenter_place(config)
     with error_prefix("segmenter.providers"):
-        _check_providers(segmenter_place(config), config.segmenter.providers)
+        _check_providers(place, section.providers)
+    with error_prefix("segmenter.provider_options"):
+        _check_options("segmenter", place, section.provider_options or {})
+
+
+def _check_options(section: str, place: ModelPlace | None, options: ProviderOptions) -> None:
+    """Warn of options of providers that would be ignored, or that ONNX Runtime does not know.
+
+    A later version may know them.
+
+    Raises:
+        ConfigError: if the configured class runs no model in ONNX Runtime.
+    """
+    if options and place is None:
+        raise ConfigError(_NOT_IN_RUNTIME)
+    if options and place and place.device is not None:
+        warn_once(f"{section}.provider_options have no effect: the model runs in {place}")
+    elif place:
+        for problem in ignored_options(place.providers, options):
+            warn_once(f"{section}.provider_options: {problem}")
 
 
 def idle_gpu(*places: ModelPlace | None) -> bool:
@@ -135,6 +161,6 @@ def idle_gpu(*places: ModelPlace | None) -> bool:
 def _check_providers(place: ModelPlace | None, listed: Providers) -> None:
     """Raise ConfigError if listed providers have no effect, or one is not installed."""
     if listed != AUTO and (place is None or place.device is not None):
-        raise ConfigError("the configured class does not run in ONNX Runtime; remove the setting")
+        raise ConfigError(_NOT_IN_RUNTIME)
     if place and place.device is None and place.providers not in (AUTO, CPU.name):
         requested_providers(place.providers)

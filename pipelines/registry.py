@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, get_origin
 
 from curate.errors import ConfigError, CurateError, one_line
+from curate.option_values import describe_wrong_values
 from curate.spelling import did_you_mean
 from pipelines.user_modules import import_user_module
 
@@ -117,8 +118,8 @@ class Registry:
             options: see `build`.
 
         Raises:
-            ConfigError: if the class cannot be imported, does not have an option, or requires
-                an argument that is not supplied.
+            ConfigError: if the class cannot be imported, does not have an option, gets a value of
+                another type or range, or requires an argument that is not supplied.
         """
         factory = self.load(name)
         parameters = inspect.signature(factory).parameters
@@ -135,6 +136,8 @@ class Registry:
             inspect.signature(factory).bind(*given, **{**supplied, **options})
         except TypeError as error:
             raise ConfigError(f"{self.kind} '{name}': {error}") from error
+        if wrong := describe_wrong_values(factory, options):
+            raise ConfigError(f"{self.kind} '{name}': option {wrong}")
         return factory
 
     def build(

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pipelines.assembly import stores_maps
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
-from pipelines.engine.rounds import is_pretrained, open_round
+from pipelines.engine.rounds import is_pretrained, is_student_trained, open_round
 from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import (
     export,
@@ -31,6 +31,7 @@ _FIRST = (
         settings=pretrain.settings,
         run=pretrain.run,
         file=pretrain.file,
+        check=pretrain.check,
         guard=pretrain.guard,
     ),
 )
@@ -134,6 +135,13 @@ def graph_of(workspace: Workspace) -> Graph:
         pretrained=is_pretrained(workspace),
         maps=stores_maps(workspace.config),
     )
+
+
+def run_graph(workspace: Workspace) -> Graph:
+    """Return the stages that a run of a workspace includes: none that trains, without a trainer."""
+    trained = is_student_trained(workspace)
+    stages = graph_of(workspace).stages
+    return Graph(tuple(each for each in stages if trained or "student" not in each.writes))
 
 
 def open_plan(

@@ -23,6 +23,8 @@ from curate.files.onnx_session import OnnxModel
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.nms import nms_bev
+from curate.option_values import describe_wrong_values
+from curate.ranges import AboveZero, AtLeastOne, Count, Share
 
 # Types of inputs of points.
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
@@ -66,18 +68,18 @@ class OnnxDetector:
         *,
         classes: Sequence[str] | None = None,
         categories: Sequence[str] = (),
-        minimum_score: float = 0.1,
+        minimum_score: Share = 0.1,
         points: str | None = None,
         outputs: Mapping[str, str] | None = None,
         convention: Mapping[str, Any] | None = None,
-        intensity_scale: float = 1.0,
-        first_label: int = 0,
+        intensity_scale: AboveZero = 1.0,
+        first_label: Count = 0,
         sigmoid: bool = False,
-        nms_iou: float | None = None,
+        nms_iou: Share | None = None,
         nms_across: bool = False,
         preprocess: str | None = None,
         postprocess: str | None = None,
-        threads: int = 1,
+        threads: AtLeastOne = 1,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
     ) -> None:
@@ -201,6 +203,8 @@ def _free(size: int | str | None) -> bool:
 
 
 def _convention(options: Mapping[str, Any]) -> BoxConvention:
+    if wrong := describe_wrong_values(BoxConvention, options):
+        raise ConfigError(f"detector.options.convention.{wrong}")
     try:
         return BoxConvention(**options)
     except TypeError as error:

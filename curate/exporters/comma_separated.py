@@ -9,6 +9,7 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar
 
@@ -58,11 +59,12 @@ def _lines(block: LabelRows, texts: Sequence[str]) -> bytes:
     """
     if not block.rows:
         return b""
-    names = [name for column in texts for name in block[column] if name is not None]
-    if all(isinstance(name, str) and _PLAIN.fullmatch(name) for name in set(names)):
+    columns = [block[column] for column in texts]
+    names = set(chain.from_iterable(columns)) - {None}
+    if all(isinstance(name, str) and _PLAIN.fullmatch(name) for name in names):
         json = to_json(block.rows, bytes_mode="hex", inf_nan_mode="constants")
         # More quotes are of a text in a column of numbers.
-        if json.count(b'"') == 2 * len(names):
+        if json.count(b'"') == 2 * sum(len(each) - each.count(None) for each in columns):
             lines = json[2:-2].replace(b"],[", b"\n").replace(b'"', b"").replace(b"null", b"")
             return lines + b"\n"
     written = io.StringIO(newline="")

@@ -21,6 +21,7 @@ from curate.files.atomic import atomic_path
 from curate.files.batches import batched
 from curate.files.parquet import load_parquet
 from curate.priors.base import Column
+from curate.ranges import AtLeastOne
 
 FORMAT = "curate weighted labels, Parquet"
 FORMAT_VERSION = "1"
@@ -41,7 +42,7 @@ class ParquetExporter:
     name: ClassVar[str] = "parquet"
     suffix: ClassVar[str] = ".parquet"
 
-    def __init__(self, rows_per_group: int = ROWS_PER_GROUP) -> None:
+    def __init__(self, rows_per_group: AtLeastOne = ROWS_PER_GROUP) -> None:
         load_parquet()
         self.rows_per_group = rows_per_group
 

@@ -9,7 +9,7 @@ with what was requested.
 import ctypes
 import io
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from curate.errors import ConfigError, first_line, one_line
+from curate.files.onnx_provider_options import KNOWN_OPTIONS
 from curate.spelling import did_you_mean
 from curate.warnings_once import note_once, warn_once
 
@@ -170,6 +171,25 @@ def providers_of_device(
     if name == "openvino":
         own = {"device_type": f"GPU.{number}" if number else "GPU"}
     return (name,), {**given, name: {**own, **given.get(name, {})}}
+
+
+def ignored_options(providers: Providers, options: ProviderOptions) -> Iterator[str]:
+    """Yield a message for every option that ONNX Runtime would ignore, or fail on later.
+
+    Raises:
+        ConfigError: if a provider is unknown.
+    """
+    listed = listed_providers(providers)
+    for name, values in options.items():
+        provider = provider_named(name)
+        if listed and provider not in listed:
+            yield f"provider '{name}' is not used, so its options have no effect"
+        elif not listed and not provider.automatic:
+            yield f"'{AUTO}' never takes provider '{name}', so its options have no effect; list it"
+        known = KNOWN_OPTIONS.get(provider.name, values)
+        for key in values:
+            if key not in known:
+                yield f"provider '{name}' has no option '{key}'{did_you_mean(key, known)}"
 
 
 def is_exclusive(providers: Providers, options: ProviderOptions | None = None) -> bool:

@@ -24,6 +24,7 @@ from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
+from curate.ranges import AboveZero
 from curate.shapes import Float
 
 CONE_RAD = np.deg2rad(4.0)
@@ -38,7 +39,7 @@ class DensityPrior(EvidenceSource):
         share: share of the expected density at which rho_density reaches 1, above 0.
     """
 
-    share: float = 0.5
+    share: AboveZero = 0.5
     name: ClassVar[str] = "density"
     columns: ClassVar[tuple[Column, ...]] = (
         Column("visible_area", "float64", "m2", "area of the box as the LiDAR sees it"),

@@ -15,6 +15,7 @@ from curate.errors import ConfigError
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
+from curate.ranges import AboveZero
 from curate.shapes import Float, Num
 
 logger = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class PointPrior(EvidenceSource):
         thresholds: m_th per category, in points; see `learn_thresholds`.
     """
 
-    thresholds: Mapping[str, float]
+    thresholds: Mapping[str, AboveZero]
     name: ClassVar[str] = "points"
     columns: ClassVar[tuple[Column, ...]] = (
         Column("points", "int32", "1", "m, LiDAR points in the box"),

@@ -18,7 +18,6 @@ cameras (seed, camera, frame id), in this order:
 
 import hashlib
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +25,7 @@ import numpy as np
 from curate.errors import ConfigError
 from curate.files.paths import StrPath
 from curate.frames import Frame
+from curate.ranges import NotNegative
 from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import class_map
 from curate.segmenters.saved import SavedSegmenter
@@ -86,7 +86,7 @@ class DegradedSegmenter(Segmenter):
     needs_image = False
     needs_points = False
 
-    def __init__(self, directory: StrPath, *, seed: int = 0, **rates: Any) -> None:
+    def __init__(self, directory: StrPath, *, seed: int = 0, **rates: NotNegative) -> None:
         self.seed = seed
         options = {field.name for field in fields(ErrorModel)}
         if unknown := sorted(set(rates) - options):
@@ -94,7 +94,7 @@ class DegradedSegmenter(Segmenter):
                 f"degraded segmenter: unknown option {unknown[0]!r}; "
                 f"use one of {', '.join(sorted(options))}"
             )
-        self.errors = ErrorModel(**rates)
+        self.errors = ErrorModel(**rates)  # type: ignore[arg-type] # it checks the types
         self._truth = SavedSegmenter(directory, class_map("simulated"))
         self.classes = self._truth.classes
 

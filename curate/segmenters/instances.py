@@ -16,6 +16,7 @@ from curate.errors import ConfigError, DataError
 from curate.files.json_text import read_json
 from curate.files.paths import StrPath
 from curate.frames import Frame
+from curate.ranges import Share
 from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.segmenters.classes import background_id, checked_classes
 from curate.segmenters.masks import decode_mask
@@ -49,7 +50,7 @@ class InstanceSegmenter(Segmenter):
         path: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
-        minimum_score: float = 0.5,
+        minimum_score: Share = 0.5,
         frame_ids: Sequence[str] = (),
     ) -> None:
         if not 0 <= minimum_score <= 1:

@@ -55,11 +55,13 @@ class MapStore:
         root: the folder of the maps of all segmenters.
         made_by: what the maps depend on besides the images, as plain types.
         limit_gib: no map is stored while the files in `root` take more than this, in GiB.
+        unstored: number of maps that could not be stored.
     """
 
     root: Path
     made_by: Mapping[str, Any]
     limit_gib: float = float("inf")
+    unstored: int = field(default=0, init=False)
     _bytes: int = field(default=0, init=False)
     _count_at: float = field(default=0.0, init=False)
 
@@ -106,13 +108,15 @@ class MapStore:
             except OSError as error:
                 reason = f"{self.folder}: {error.strerror}"
         if reason:
+            self.unstored += 1
             warn_once(f"{reason}; {_NOT_STORED}")
 
     def refusal(self) -> str:
         """Return why no further map can be stored; "" if one can."""
         if self._used_bytes() >= self.limit_gib * _GIB:
+            limit = shown_size(self.limit_gib * _GIB)
             return (
-                f"{self.root}: the stored semantic maps take {self.limit_gib:g} GiB, the limit "
+                f"{self.root}: the stored semantic maps take {limit}, the limit "
                 "segmenter.cache_limit: raise it in curate.toml, or delete the folders of "
                 "segmenters that you no longer use (segmenter.json in each says which one)"
             )
@@ -224,6 +228,8 @@ class StoringSegmenter(Segmenter):
         made = self.segmenter.segment(self._with_image(frame))
         if made.class_ids.shape == size[::-1] and made.class_ids.dtype == np.uint8:
             self.store.write(image, made)
+        else:
+            self.store.unstored += 1
         return made
 
     def _image_path(self, frame: Frame) -> Path | None:
@@ -241,6 +247,14 @@ class StoringSegmenter(Segmenter):
             return frame
         whole = self._dataset.read(frame.frame_id, points=False, image=True)
         return next(view for view in whole.views() if view.camera == frame.camera)
+
+
+def shown_size(size: float) -> str:
+    """Return a number of bytes as text: "20 GiB", "1.5 MiB", "700 bytes"."""
+    for power, unit in ((30, "GiB"), (20, "MiB"), (10, "KiB")):
+        if size >= 1 << power:
+            return f"{size / (1 << power):.4g} {unit}"
+    return f"{size:.0f} bytes"
 
 
 def _size(folder: Path) -> int:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -32,9 +33,10 @@ from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
+from curate.ranges import AtLeastOne
 from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import checked_classes
-from curate.segmenters.onnx_images import ImageModel, image_of
+from curate.segmenters.onnx_images import ImageModel, Scaling, image_of
 
 # An image is cut into crops if it would have to be squeezed by more than this factor.
 _SQUEEZE_LIMIT = 1.5
@@ -43,7 +45,7 @@ _EXPECTED = "expected class ids [1, h, w], or scores [1, classes, h, w] or [1, h
 # Outputs that are the map where a model has several: of torchvision ("aux" is the other) and of
 # Hugging Face.
 _USUAL_NAMES = ("out", "logits")
-_LAYOUTS = ("first", "last")
+Layout = Literal["first", "last"]
 _MAX_CROPPED_PIXELS = 4 * MAX_PIXELS  # of all crops of an image
 # h and w are those of the input up to a common factor, rounded or padded by at most this ratio.
 _MAX_ASPECT_ERROR = 1.25
@@ -83,17 +85,17 @@ class OnnxSegmenter(Segmenter):
         model: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
-        tiles: int | None = None,
-        scaling: str = "imagenet",
+        tiles: AtLeastOne | None = None,
+        scaling: Scaling = "imagenet",
         output: str | None = None,
-        channels: str | None = None,
-        threads: int = 1,
+        channels: Layout | None = None,
+        threads: AtLeastOne = 1,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
     ) -> None:
         if tiles is not None and tiles < 1:
             raise ConfigError(f"segmenter.options.tiles {tiles}: expected at least 1")
-        if channels not in {None, *_LAYOUTS}:
+        if channels not in {None, *get_args(Layout)}:
             raise ConfigError(f"segmenter.options.channels {channels!r}: use first or last")
         self.classes = checked_classes(classes)
         self.tiles = tiles

@@ -1,9 +1,9 @@
 """ONNX models with one image as input: its type, axis order, size and scaling."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,10 +12,12 @@ from curate.errors import ConfigError, ModelError
 from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import ModelValue, OnnxModel, is_numeric_array
 from curate.frames import Frame
+from curate.ranges import AtLeastOne
 
 # Mean and standard deviation of ImageNet's RGB, as used to train most published models.
 _IMAGENET = (np.array([0.485, 0.456, 0.406]) * 255, np.array([0.229, 0.224, 0.225]) * 255)
-SCALINGS = {
+Scaling = Literal["imagenet", "unit", "none"]
+SCALINGS: Mapping[Scaling, tuple[np.ndarray, np.ndarray]] = {
     "imagenet": _IMAGENET,
     "unit": (np.zeros(3), np.full(3, 255.0)),
     "none": (np.zeros(3), np.ones(3)),
@@ -58,7 +60,7 @@ class ImageInput:
     height: int | None
     width: int | None
 
-    def feed(self, images: Sequence[np.ndarray], scaling: str) -> dict[str, np.ndarray]:
+    def feed(self, images: Sequence[np.ndarray], scaling: Scaling) -> dict[str, np.ndarray]:
         """Return the session's inputs for (height, width, 3) uint8 RGB images of the input size.
 
         Several images need an input that takes several.
@@ -98,8 +100,8 @@ class ImageModel:
     def __init__(
         self,
         path: Path,
-        scaling: str,
-        threads: int,
+        scaling: Scaling,
+        threads: AtLeastOne,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
         *,

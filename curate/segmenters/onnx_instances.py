@@ -17,9 +17,10 @@ from curate.files.onnx_providers import AUTO, ProviderOptions, Providers
 from curate.files.onnx_session import is_numeric_array
 from curate.files.paths import StrPath
 from curate.frames import Frame
+from curate.ranges import AtLeastOne, Share
 from curate.segmenters.base import Segmenter, SemanticMap
 from curate.segmenters.classes import background_id, checked_classes
-from curate.segmenters.onnx_images import ImageModel, image_of
+from curate.segmenters.onnx_images import ImageModel, Scaling, image_of
 from curate.segmenters.onnx_outputs import KINDS, Instance
 from curate.segmenters.pasting import Box, paste_mask
 
@@ -60,10 +61,10 @@ class OnnxInstanceSegmenter(Segmenter):
         classes: Mapping[str, Sequence[int]],
         *,
         outputs: Mapping[str, str] | None = None,
-        minimum_score: float = 0.5,
+        minimum_score: Share = 0.5,
         mask_threshold: float = 0.5,
-        scaling: str = "unit",
-        threads: int = 1,
+        scaling: Scaling = "unit",
+        threads: AtLeastOne = 1,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,
     ) -> None:

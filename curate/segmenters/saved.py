@@ -3,6 +3,7 @@
 import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from curate.datasets.frame_names import files_by_frame
 from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Frame
+from curate.ranges import AtLeastOne
 from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.segmenters.classes import CLASS_MAPS, checked_classes, describe_unexpected_ids
 from curate.segmenters.colours import COLOUR_TABLES, colour_table, ids_of_colours
@@ -18,7 +20,8 @@ from curate.segmenters.map_files import MapFile, read_map
 _MAX_CLASSES = 256
 _SUFFIXES = (".png", ".npy")
 _PATTERNS = tuple(f"*{suffix}" for suffix in _SUFFIXES)
-_CHANNELS = ("red", "green", "blue")
+Channel = Literal["red", "green", "blue"]
+_CHANNELS = get_args(Channel)
 # What a value below the divisor is, where a published format defines it: a class without
 # instances in Cityscapes' instanceIds, an instance of class 0 in KITTI's semantic instances.
 _BELOW = {1000: "class", 256: "instance"}
@@ -57,10 +60,10 @@ class SavedSegmenter(Segmenter):
         directory: StrPath,
         classes: Mapping[str, Sequence[int]],
         *,
-        divisor: int | None = None,
-        below: str | None = None,
+        divisor: AtLeastOne | None = None,
+        below: Literal["class", "instance"] | None = None,
         colours: str | Mapping[str, Sequence[int]] | None = None,
-        channel: str | None = None,
+        channel: Channel | None = None,
         frame_ids: Sequence[str] = (),
     ) -> None:
         if divisor is not None and not (type(divisor) is int and divisor >= 1):

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from curate.detectors.precision import FLOAT32, Precision
 from curate.errors import ConfigError
+from curate.ranges import AboveZero, AtLeastOne, Count, NotNegative, Share
 from curate.training.augmentation import Augmentation
 
 Teacher = Literal["student", "ema"]
@@ -47,26 +48,26 @@ class TrainingSettings:
     """
 
     preset: str | None = None
-    steps: int = 1200
-    batch_size: int = 2
-    unlabeled_batch_size: int = 2
-    learning_rate: float = 5e-3
-    flip_probability: float = 0.5
-    rotation_limit_rad: float = math.pi / 4
-    scale_range: tuple[float, float] = (0.95, 1.05)
-    pasted: int = 4
-    fewest_points: int = 5
-    seed: int = 0
-    processes: int = 1
-    threads: int = 1
-    loaders: int = 0
+    steps: AtLeastOne = 1200
+    batch_size: AtLeastOne = 2
+    unlabeled_batch_size: Count = 2
+    learning_rate: AboveZero = 5e-3
+    flip_probability: Share = 0.5
+    rotation_limit_rad: NotNegative = math.pi / 4
+    scale_range: tuple[AboveZero, AboveZero] = (0.95, 1.05)
+    pasted: Count = 4
+    fewest_points: Count = 5
+    seed: Count = 0
+    processes: AtLeastOne = 1
+    threads: AtLeastOne = 1
+    loaders: Count = 0
     device: str = "cpu"
     precision: Precision = FLOAT32
     teacher: Teacher = "student"
     ema_decay: float = 0.999
-    cache_bytes: int = 1 << 30
-    snapshot_seconds: float = 20.0
-    statistics_steps: int = 20
+    cache_bytes: Count = 1 << 30
+    snapshot_seconds: NotNegative = 20.0
+    statistics_steps: AtLeastOne = 20
 
     def __post_init__(self) -> None:
         """Raise ConfigError if a setting is out of its range."""

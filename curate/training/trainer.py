@@ -31,8 +31,10 @@ from curate.training.loop import (
 from curate.training.processes import Launch, run_in_processes
 from curate.training.settings import TrainingReport, TrainingSettings
 from curate.training.snapshot import find_snapshot, fingerprint, snapshot_path
+from curate.warnings_once import NOTES, warn_once
 
 _log = logging.getLogger(__name__)
+_notes = logging.getLogger(NOTES)
 
 # Arguments: number of the step, number of steps, loss of the step.
 Progress = Callable[[int, int, float], None]
@@ -143,6 +145,11 @@ class _Writer:
         """Show the progress, write a snapshot, or keep the result."""
         if isinstance(message, Started) and not hasattr(self, "started"):
             self.started, self._saved_step = message, message.step
+            if message.step:
+                _notes.info(
+                    "%s: the training resumes from step %d of %d",
+                    *(self._output.stem, message.step, self._steps),
+                )
             for category, objects in message.bank.items():
                 if not objects:
                     _log.warning("%s: no labeled %s to learn from", self._labels, category)
@@ -174,10 +181,9 @@ def _useful_processes(settings: TrainingSettings, samples: WeightedLabels) -> in
     unlabeled = 0 if samples.labeled.all() else settings.unlabeled_batch_size
     frames = settings.batch_size + unlabeled
     if settings.processes > frames:
-        _log.warning(
-            "%d of %d training processes are used: a step has %d frames (train.batch_size, "
-            "train.unlabeled_batch_size)",
-            *(min(settings.processes, frames), settings.processes, frames),
+        warn_once(
+            f"{min(settings.processes, frames)} of {settings.processes} training processes are "
+            f"used: a step has {frames} frames (train.batch_size, train.unlabeled_batch_size)"
         )
     return min(settings.processes, frames)
 

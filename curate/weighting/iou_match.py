@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.ranges import Share
 from curate.weighting.base import Age, Evidence, Policy, Weights
 from curate.weighting.threshold import by_category, check_share
 
@@ -28,10 +29,10 @@ class IoUMatch(Policy):
         iou_per_category: IoU thresholds of categories that differ from `iou`.
     """
 
-    score: float = 0.4
-    iou: float = 0.25
-    score_per_category: Mapping[str, float] = field(default_factory=dict)
-    iou_per_category: Mapping[str, float] = field(default_factory=lambda: {"Car": 0.5})
+    score: Share = 0.4
+    iou: Share = 0.25
+    score_per_category: Mapping[str, Share] = field(default_factory=dict)
+    iou_per_category: Mapping[str, Share] = field(default_factory=lambda: {"Car": 0.5})
     name: ClassVar[str] = "3dioumatch"
 
     def __post_init__(self) -> None:

@@ -20,6 +20,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.ranges import PositiveShare
 from curate.shapes import Bool, Float
 from curate.weighting.base import Age, Evidence, Policy, Weights
 
@@ -39,7 +40,7 @@ class SPSL(Policy):
     """
 
     scope: Scope = "round"
-    quantile: float | None = None
+    quantile: PositiveShare | None = None
     name: ClassVar[str] = "spsl"
 
     def __post_init__(self) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from curate.errors import ConfigError
 from curate.geometry.overlap import overlapping_pairs
+from curate.ranges import PositiveShare, Share
 from curate.weighting.base import Age, Evidence, Memory, Policy, Weights, ZeroWeight
 
 Confidence = Literal["score", "iou"]
@@ -32,10 +33,10 @@ class ST3D(Policy):
         minimum_iou: lowest 3D IoU of a label and a stored one that count as the same object.
     """
 
-    keep: float = 0.6
-    ignore: float = 0.25
+    keep: Share = 0.6
+    ignore: Share = 0.25
     confidence: Confidence = "score"
-    minimum_iou: float = 0.1
+    minimum_iou: PositiveShare = 0.1
     name: ClassVar[str] = "st3d"
     remembers: ClassVar[bool] = True
     zero_weight: ClassVar[ZeroWeight] = "ignore"
@@ -83,7 +84,7 @@ class ST3D(Policy):
 
 
 def _matches(
-    evidence: Evidence, memory: Memory, minimum_iou: float
+    evidence: Evidence, memory: Memory, minimum_iou: PositiveShare
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of labels and of stored labels that are each other's best match by 3D IoU.
 

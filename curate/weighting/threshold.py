@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from curate.errors import ConfigError
+from curate.ranges import Share
 from curate.shapes import Float
 from curate.weighting.base import Age, Evidence, Policy, Weights
 
@@ -20,8 +21,8 @@ class Threshold(Policy):
         per_category: thresholds of categories that differ from `threshold`.
     """
 
-    threshold: float = 0.3
-    per_category: Mapping[str, float] = field(default_factory=dict)
+    threshold: Share = 0.3
+    per_category: Mapping[str, Share] = field(default_factory=dict)
     name: ClassVar[str] = "threshold"
     reads: ClassVar[tuple[str, ...]] = ("category", "score")
 

@@ -22,6 +22,7 @@ from pipelines.assembly import (
     Place,
     check_detector,
     check_segmenter,
+    check_training_options,
     open_detector,
     open_segmenter,
     wants_views,
@@ -70,6 +71,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     except CurateError as error:
         return name, [Finding("data set", "wrong", str(error))]
     findings = [*_guarded("devices", lambda: _devices(workspace, semantic=semantic))]
+    findings += _guarded("training", lambda: _training(workspace.config))
     findings += [*_names(find_differences(workspace)), *examine_frame(frame)]
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
@@ -113,6 +115,12 @@ def _devices(workspace: Workspace, *, semantic: bool) -> Sequence[Finding]:
     if idle_gpu(*places.values()):
         used += "; the NVIDIA GPU of this machine is not used, see docs/install.md#gpus"
     return [Finding("devices", "ok", used or "no model runs here")]
+
+
+def _training(config: Config) -> Sequence[Finding]:
+    """Check the settings of curate's trainer; there is nothing to report if they are valid."""
+    check_training_options(config)
+    return []
 
 
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:

@@ -10,10 +10,11 @@ from pydantic import ValidationError
 
 from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.files.atomic import replace_file
+from curate.ranges import AtLeastOne
 from curate.spelling import did_you_mean
 from pipelines.registry import trainable, trainable_names
 from pipelines.stages.methods import METHODS, with_method
-from pipelines.workspace.config import AtLeastOne, Config, Section, change_setting, make_config
+from pipelines.workspace.config import Config, Section, change_setting, make_config
 from pipelines.workspace.config_errors import describe_errors
 
 SYNTHETIC = "synthetic"

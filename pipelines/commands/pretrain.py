@@ -38,6 +38,8 @@ def pretrain(
         raise ConfigError(
             f"detector '{opened.config.detector.name}' needs no pretraining; run `curate predict`"
         )
+    for first in firsts:
+        first.check(opened)
     if dry_run:
         print_preview((preview_first(opened, first) for first in firsts), as_json=as_json)
         return

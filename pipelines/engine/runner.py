@@ -356,6 +356,9 @@ class _Writer:
 
     def add(self, outcome: Outcome) -> None:
         """Add an outcome to the batch, and write the batch if it is due."""
+        unstored = outcome.error is None and not any(outcome.rows)
+        if isinstance(self.stage, CacheStage) and unstored:
+            return  # the frame stays waiting
         self._pending.append(outcome)
         if outcome.ends_job and (
             len(self._pending) >= FLUSH_FRAMES or time.monotonic() - self._flushed > FLUSH_S

@@ -15,7 +15,7 @@ from pipelines.engine.runner import (
     run_frames,
     run_round,
 )
-from pipelines.engine.stage import FramesStage, RoundStage
+from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
 from pipelines.workspace.workspace import Workspace
 
 
@@ -68,6 +68,8 @@ def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: b
     """
     check_executor(workspace.config)
     for stage in graph.stages:
+        if isinstance(stage, FirstStage):
+            stage.check(workspace)
         if isinstance(stage, RoundStage) and stage.check:
             stage.check(workspace, policy)
         if evidence and isinstance(stage, FramesStage) and stage.check:

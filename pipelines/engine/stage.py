@@ -133,12 +133,14 @@ class FirstStage(_Stage):
         settings: function that returns everything that the result depends on.
         run: function that does the work.
         file: function that returns the path of the file it writes.
+        check: check of its settings before any work; raises an error.
         guard: check at every start, even if the stage is up to date; raises LeakageError.
     """
 
     settings: Callable[[Workspace], Any]
     run: Callable[[Workspace, Progress], Product]
     file: Callable[[Workspace], Path]
+    check: Callable[[Workspace], None]
     guard: Callable[[Workspace], None]
 
 
@@ -182,7 +184,8 @@ class CacheStage(_FramesStage):
     only frames that one of its readers will read.
 
     Attributes:
-        function: function that returns what the stage does with a frame; it returns no rows.
+        function: function that returns what the stage does with a frame. That returns an entry for
+            what was stored; without one, the frame is not done.
         refusal: function that returns a function, which returns why nothing further can be stored;
             "" if it can. The stage then ends early.
         exists: function that returns whether the folder of what it stored is there.

@@ -1,13 +1,11 @@
 """Where a training runs: in this process, in several of this machine, or on a Ray cluster."""
 
-import logging
 from typing import Literal
 
 from curate.training.processes import Launch, run_in_processes
+from curate.warnings_once import warn_once
 from pipelines.engine.executors.machine import affordable_workers, usable_cores
 from pipelines.workspace.config import Config
-
-_log = logging.getLogger(__name__)
 
 # What a process of a training needs besides its share of the frames that are kept in memory: 540
 # MiB were measured for the smallest preset.
@@ -19,7 +17,8 @@ _WORTH_STEPS = 100
 def plan_training(config: Config, steps: int, frames: int, device: str) -> tuple[int, Launch]:
     """Return the number of processes of a training, and what starts them.
 
-    It warns if this machine is too small. On a Ray cluster the nodes have the cores and the memory.
+    It gives one warning if this machine is too small. On a Ray cluster the nodes have the cores and
+    the memory.
 
     Args:
         config: the configuration.
@@ -45,11 +44,14 @@ def _processes_here(wanted: int | Literal["auto"], threads: int, frames: int, de
 
         return min(cuda.device_count(), frames) if wanted == "auto" else wanted
     places = max(1, usable_cores() // threads)
-    count = min(places, frames) if wanted == "auto" else wanted
+    count = min(places if wanted == "auto" else wanted, frames)
+    allowed = affordable_workers(count, _PROCESS_BYTES)
+    if allowed < count or wanted == "auto":
+        return allowed
     if count > places:
-        _log.warning(
-            "train.processes is %d and train.threads %d, but only %d cores can be used: a training "
-            "with more processes than cores is slower",
-            *(count, threads, usable_cores()),
+        warn_once(
+            f"train.processes is {wanted} and train.threads {threads}, but only {usable_cores()} "
+            "cores can be used: a training with more processes than cores is slower"
         )
-    return affordable_workers(count, _PROCESS_BYTES)
+        return count
+    return wanted  # the training reports processes without a frame

@@ -1,7 +1,7 @@
 """pretrain: train the first teacher w_0 on X_l alone; not used with an external detector."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, func, select
 
@@ -22,6 +22,9 @@ from pipelines.stages.train_round import (
     unset_precision,
 )
 from pipelines.workspace.workspace import Workspace
+
+if TYPE_CHECKING:
+    from curate.training.settings import TrainingSettings
 
 _LATER_SETTINGS = {  # settings without effect on the first training
     "round_steps", "round_learning_rate", "unlabeled_batch_size", "processes", "threads",
@@ -56,6 +59,15 @@ def settings(workspace: Workspace) -> Any:
         config.detector.name,
         trained.detector.checkpoint_version,
     ]
+
+
+def check(workspace: Workspace) -> None:
+    """Check the settings of the trainer.
+
+    Raises:
+        ConfigError: if the trainer does not have a setting, or its value is wrong.
+    """
+    _training_settings(workspace)
 
 
 def file(workspace: Workspace) -> Path:
@@ -99,13 +111,7 @@ def run(workspace: Workspace, progress: Progress) -> Product:
         workspace,
         labels=labels,
         output=path,
-        settings=training_settings(
-            workspace,
-            config.train.pretrain_steps,
-            config.train.learning_rate,
-            0,
-            METHODS["baseline"],
-        ),
+        settings=_training_settings(workspace),
         start=None,
         frames=config.train.batch_size,
         progress=progress,
@@ -118,6 +124,13 @@ def run(workspace: Workspace, progress: Progress) -> Product:
 
     frames = len(workspace.frames("labeled"))
     return Product(f"{report.steps} steps on {frames} frames, {workspace.relative(path)}", write)
+
+
+def _training_settings(workspace: Workspace) -> "TrainingSettings":
+    section = workspace.config.train
+    return training_settings(
+        workspace, section.pretrain_steps, section.learning_rate, 0, METHODS["baseline"]
+    )
 
 
 def _labels(workspace: Workspace) -> Path:

@@ -44,13 +44,15 @@ class Segment(ReadsAhead):
     def open(self) -> None:
         """Open the data set and the segmenter."""
         self.read = FrameReader(partial(open_dataset(self.config).read, points=False))
-        self.segmenter = open_segmenter(self.config)
+        self.store = open_map_store(self.config)
+        self.segmenter = open_segmenter(self.config, self.store)
 
     def __call__(self, job: FrameJob) -> FrameRows:
-        """Store the map of each camera's image; there are no rows."""
+        """Store the map of each camera's image; return an entry if all of them are stored."""
+        before = self.store.unstored
         for view in self.read(job.frame).views():
             self.segmenter.segment(view)
-        return {}
+        return {"maps": {}} if self.store.unstored == before else {}
 
 
 def settings(workspace: Workspace, _context: RoundContext) -> dict[str, Any]:

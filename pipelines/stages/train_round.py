@@ -1,6 +1,6 @@
 """train-round: train the student from the exported labels and the teacher."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,15 +9,15 @@ from sqlalchemy import Connection
 
 from curate.datasets.base import Dataset
 from curate.detectors.devices import AUTO, choose_device
-from curate.detectors.precision import FLOAT32
-from curate.errors import ConfigError, one_line
+from curate.detectors.precision import FLOAT32, mixed_precision
+from curate.errors import ConfigError, error_prefix
 from curate.files.onnx_providers import CPU
 from curate.frames import Frame
-from curate.spelling import did_you_mean
 from db import bulk
 from pipelines.assembly import (
     check_labels_format,
     check_policy,
+    check_training_options,
     trainable_detector,
     trained_detector,
     trainer_command,
@@ -202,13 +202,17 @@ def training_settings(
 
     Raises:
         ConfigError: if `train.options` has a setting that the trainer does not have, or a wrong
-            value.
+            value, or the device does not have the precision.
     """
     from curate.training.settings import TrainingSettings
 
     section = workspace.config.train
+    check_training_options(workspace.config)
     device = choose_device(workspace.config.detector.device)
-    values = {
+    if section.precision != FLOAT32:
+        with error_prefix("train.precision"):
+            mixed_precision(section.precision, device)
+    values: dict[str, Any] = {
         "preset": trained_detector(workspace.config).preset,
         "steps": steps,
         "batch_size": section.batch_size,
@@ -225,16 +229,7 @@ def training_settings(
         "loaders": loaders(section, device),
         "precision": section.precision,
     }
-    try:
-        return TrainingSettings(**{**values, **section.options})
-    except TypeError as error:
-        names = [field.name for field in fields(TrainingSettings) if field.name not in values]
-        unknown = [name for name in section.options if name not in {*names, *values}]
-        reason = f"unknown setting '{unknown[0]}'" if unknown else one_line(error)
-        meant = did_you_mean(unknown[0], names) if unknown else ""
-        raise ConfigError(
-            f"train.options of curate.toml: {reason}{meant}; it accepts {', '.join(names)}"
-        ) from None
+    return TrainingSettings(**{**values, **section.options})
 
 
 def train_with_progress(

@@ -27,18 +27,16 @@ from curate.detectors.precision import Precision
 from curate.errors import ConfigError, one_line
 from curate.evaluation.kitti_rules import overlaps_of
 from curate.files.text import read_text
-from curate.files.toml_text import parse_toml
+from curate.files.toml_text import parse_toml, toml
+from curate.ranges import AtLeastOne, Count, Share
 from pipelines import registry
 from pipelines.workspace.config_errors import describe_errors
 from pipelines.workspace.names import KnownClassSet, KnownDevice, KnownName, KnownProvider
 
-Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Scale = Annotated[float, Field(gt=0, le=100)]
 Overlaps = dict[str, Annotated[float, Field(gt=0, lt=1)]]
-AtLeastOne = Annotated[int, Field(ge=1)]
-Count = Annotated[int, Field(ge=0)]
 PointCount = Annotated[float, Field(ge=1, allow_inf_nan=False)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Options = dict[str, Any]
@@ -51,14 +49,6 @@ PolicyName = Annotated[str, KnownName(registry.POLICIES)]
 ExporterName = Annotated[str, KnownName(registry.EXPORTERS)]
 ExecutorName = Annotated[str, KnownName(registry.EXECUTORS)]
 ProviderName = Annotated[str, KnownProvider()]
-ProviderTable = Annotated[
-    dict[ProviderName, Options] | None,
-    Field(
-        description="Options of the providers by their names.",
-        examples=[{"cuda": {"device_id": 1}}],
-    ),
-]
-
 DEFAULT_PRIORS = ("points", "semantic")
 
 
@@ -113,6 +103,26 @@ ProviderNames = Annotated[
     Annotated[tuple[ProviderName, ...], Field(min_length=1), AfterValidator(_each_once)]
     | Literal["auto"],
     BeforeValidator(_as_list),
+]
+
+
+def _plain_options(options: dict[str, dict[str, Any]] | None) -> dict[str, dict[str, Any]] | None:
+    for provider, values in (options or {}).items():
+        for key, value in values.items():
+            if not isinstance(value, str | int | float):
+                raise ValueError(  # noqa: TRY004 - pydantic collects ValueError
+                    f"{provider}.{key} = {toml(value)}: use a string, a number, true or false"
+                )
+    return options
+
+
+ProviderTable = Annotated[
+    dict[ProviderName, Options] | None,
+    AfterValidator(_plain_options),
+    Field(
+        description="Options of the providers by their names.",
+        examples=[{"cuda": {"device_id": 1}}],
+    ),
 ]
 
 

@@ -53,6 +53,19 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
+def test_a_training_in_mixed_precision_begins_like_one_in_full(
+    detector: Any, make_labels: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The loss of the first step, from the same weights."""
+    labels, output = make_labels(labeled=2), tmp_path / f"a{detector.checkpoint_suffix}"
+    options = {"steps": 1, "statistics_steps": 1}
+    full, mixed = (
+        trained(detector, labels, output, precision=precision, **options).loss
+        for precision in ("float32", "bfloat16")
+    )
+    assert mixed == pytest.approx(full, rel=0.01)
+
+
 @pytest.mark.parametrize("teacher", ["student", "ema"])
 def test_a_resumed_training_ends_with_the_same_files(
     detector: Any, make_labels: Callable[..., Path], tmp_path: Path, teacher: str

@@ -1,6 +1,7 @@
 """Where models run: device and providers of the configuration, on machines that are not here."""
 
 import threading
+import warnings
 
 import pytest
 import torch
@@ -9,7 +10,9 @@ from support.pipelines_cli import Curate
 from support.tiny_onnx import tiny_detector
 
 from curate.detectors.devices import check_device_name, choose_device
+from curate.detectors.precision import mixed_precision
 from curate.errors import ConfigError, DataError
+from curate.warnings_once import warn_once
 from pipelines.assembly import check_detector, check_segmenter, made_by, open_detector
 from pipelines.devices import ModelPlace, detector_place, idle_gpu, segmenter_place
 from pipelines.stages.predict import settings_of_results
@@ -80,6 +83,7 @@ def test_the_torch_library_is_not_imported_where_it_has_no_gpu(monkeypatch):
         ({"segmenter": {"providers": ["cuda", "cuda"]}}, "segmenter.providers: 'cuda' is listed "),
         ({"segmenter": {"providers": []}}, "segmenter.providers: .* use a list of cuda, .*auto"),
         ({"detector": {"provider_options": {"cud": {}}}}, "provider_options.*did you mean 'cuda'"),
+        ({"detector": {"provider_options": {"cuda": {"a": [1]}}}}, r"cuda.a = \[1\]: use a string"),
         ({"detector": {"device": "gpu"}}, "detector.device: unknown device 'gpu': .*'cuda'"),
         ({"detector": {"device": "cudda:1"}}, "unknown device 'cudda:1'.*did you mean 'cuda'"),
         ({"detector": {"device": "auto:1"}}, "unknown device 'auto:1'"),
@@ -102,6 +106,7 @@ def test_any_device_of_torch_can_be_named(name):
         ({"device": "cuda:99"}, "detector.device: device 'cuda:99' cannot be used by torch"),
         ({"device": "npu"}, "detector.device: device 'npu' cannot be used by torch"),
         ({"name": "recorded", "providers": "cpu"}, "detector.providers: .* not run in ONNX Runt"),
+        ({"name": "recorded", "provider_options": {"cpu": {}}}, "detector.provider_options: .* no"),
         ({"providers": "cuda"}, "detector.providers: provider 'cuda' is not in the installed"),
         ({"name": "onnx", "device": "cuda"}, "detector.device: provider 'cuda' is not in the inst"),
         ({"name": "onnx", "device": "hpu"}, "detector.device: ONNX Runtime has no provider for d"),
@@ -132,6 +137,49 @@ def test_providers_and_their_options_reach_the_model(monkeypatch, tmp_path):
     section["provider_options"] = {"cuda": {"device_id": 1}}
     open_detector(config(detector=section), tmp_path / "a.onnx")
     assert runtime.opened == [{"CUDA": {"use_tf32": 0, "device_id": 1}}]
+
+
+@pytest.mark.parametrize(
+    ("detector", "options", "message"),
+    [
+        (
+            {"providers": ["cuda"]}, {"cuda": {"devise_id": 1, "use_tf32": 1}},
+            "provider 'cuda' has no option 'devise_id'; did you mean 'device_id'?",
+        ),
+        ({"providers": "cpu"}, {"cpu": {"threads": 2}}, "provider 'cpu' has no option 'threads'"),
+        (
+            {"device": "cpu"}, {"cuda": {"device_id": 1}},
+            "provider 'cuda' is not used, so its options have no effect",
+        ),
+        (
+            {"name": "onnx"}, {"tensorrt": {"trt_fp16_enable": True}},
+            "'auto' never takes provider 'tensorrt', so its options have no effect; list it",
+        ),
+        ({"name": "onnx"}, {"cuda": {"device_id": 1}, "openvino": {"device_type": "GPU"}}, None),
+        ({"providers": "VitisAIExecutionProvider"}, {"VitisAIExecutionProvider": {"new": 1}}, None),
+    ],
+)  # fmt: skip
+def test_options_that_would_be_ignored_are_reported_at_the_start(
+    detector, options, message, monkeypatch, caplog, tmp_path
+):
+    """Once, before a model is loaded; ONNX Runtime ignores some, and fails late on others."""
+    warn_once.cache_clear()
+    fake_providers(monkeypatch, FakeRuntime(("CUDA", "VitisAI")))
+    section = {"path": str(tmp_path), "provider_options": options, **detector}
+    for _ in range(2):
+        check_detector(config(detector=section))
+    assert caplog.messages == ([f"detector.provider_options: {message}"] if message else [])
+
+
+def test_options_of_providers_have_no_effect_in_torch(monkeypatch, caplog, tmp_path):
+    """A detector that can run in both runs in torch on a GPU."""
+    warn_once.cache_clear()
+    monkeypatch.setattr("pipelines.devices.choose_device", lambda device: "cuda")
+    options = {"cuda": {"device_id": 1}}
+    check_detector(config(detector={"path": str(tmp_path), "provider_options": options}))
+    assert caplog.messages == [
+        "detector.provider_options have no effect: the model runs in torch on cuda"
+    ]
 
 
 def test_results_of_another_device_or_provider_stay_valid():
@@ -213,6 +261,26 @@ def test_a_mixed_precision_needs_a_detector_in_torch(gpu, tmp_path):
         section = {"path": str(tmp_path), "precision": "bfloat16", **other}
         with pytest.raises(ConfigError, match=r"detector\.precision: .*remove the setting"):
             check_detector(config(detector=section))
+
+
+def test_float16_on_the_cpu_is_reported_once(caplog, gpu):
+    """It is many times slower; bfloat16 is not."""
+    warn_once.cache_clear()
+    for precision in ("bfloat16", "float16", "float16"):
+        check_detector(config(detector={"device": "cpu", "precision": precision}))
+    [message] = caplog.messages
+    assert message.startswith("precision 'float16' is many times slower than 'float32' on the CPU")
+
+
+def test_a_precision_that_torch_would_not_use_is_an_error(monkeypatch):
+    """Torch itself warns and computes in float32."""
+
+    def autocast(kind, dtype):
+        warnings.warn(f"In {kind} autocast, but the target dtype is not supported", stacklevel=1)
+
+    monkeypatch.setattr(torch, "autocast", autocast)
+    with pytest.raises(ConfigError, match="precision 'bfloat16' cannot be used on mps: In mps"):
+        mixed_precision("bfloat16", "mps")
 
 
 def test_a_precision_is_part_of_what_results_depend_on():

@@ -71,6 +71,51 @@ def test_a_new_workspace_would_run_everything(made: Path, dry: Callable) -> None
     assert {each["seconds"] for each in found.values()} == {None}
 
 
+@pytest.mark.parametrize(
+    ("changes", "stages"),
+    [
+        ((), STAGES),
+        ((("support.toys:ToySegmenter", "support.toys:ToyImageSegmenter"),), ("segment", *STAGES)),
+        (
+            (
+                ("support.toys:ToySegmenter", "support.toys:ToyImageSegmenter"),
+                ('priors = ["points", "semantic"]', 'priors = ["points"]'),
+            ),
+            tuple(stage for stage in STAGES if stage != "semantic"),
+        ),
+        (
+            (
+                ("support.toys:ToyDetector", "pillars"),
+                ("\npath = ", "\n# path = "),
+                ('priors = ["points", "semantic"]', 'priors = ["points"]'),
+            ),
+            ("pretrain", *STAGES[:3], *STAGES[4:], "train-round"),
+        ),
+    ],
+)
+def test_the_graph_has_the_stages_of_a_run(
+    curate: Curate, made: Path, dry: Callable, changes: tuple, stages: tuple[str, ...]
+) -> None:
+    """Of the workspace, in its order; outside of one, all stages are shown."""
+    for former, later in changes:
+        change(made, former, later)
+    shown = json.loads(curate("graph", "--json", "-w", made)[1])
+    assert tuple(each["name"] for each in shown) == stages
+    assert tuple(dry("run", "--rounds", 1)) == stages
+
+
+def test_outside_a_workspace_the_graph_has_all_stages(
+    curate: Curate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that is named must be a workspace."""
+    monkeypatch.chdir(tmp_path)
+    shown = json.loads(curate("graph", "--json")[1])
+    assert tuple(each["name"] for each in shown) == ("pretrain", "segment", *STAGES, "train-round")
+    code, _, err = curate("graph", "-w", tmp_path)
+    assert code == WorkspaceError.exit_code
+    assert "no workspace here" in err
+
+
 @pytest.mark.parametrize("command", ["run", "predict", "pretrain", "repredict", "score"])
 def test_nothing_is_written(curate: Curate, made: Path, command: str) -> None:
     """Neither rows, such as the round or the detector, nor files; whatever the output."""

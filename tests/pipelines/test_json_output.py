@@ -42,7 +42,7 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
             work, "--root", data, "--labeled", 0.25, "--detector", detector,
             *(word for setting in short for word in ("--set", setting)),
         ),
-        "graph": (),
+        "graph": there,
         "status": there,
         "doctor": there,
         "pretrain": there,

@@ -161,6 +161,22 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
         ("run.method=no_such_package:X", "run.method: policy 'no_such_package:X' cannot be"),
         ("solve.options.pspsl.scoop=1", "policy 'pspsl' has no option 'scoop'; did you mean 'scop"),
         ("segmenter.name=no_such_package:X", "segmenter.name: segmenter 'no_such_package:X' cann"),
+        (
+            "detector.options.nms_iou=2",
+            "option nms_iou = 2 should be less than or equal to 1",
+        ),
+        ("detector.options.threads=0", "option threads = 0 should be greater than or equal to 1"),
+        ("run.executor_options.auto.workers=0.5", "option workers = 0.5 should be a valid integer"),
+        (
+            "solve.options.pspsl.scope=7",
+            "option scope = 7 should be 'round', 'category' or",
+        ),
+        ("dataset.options.camera='left'", 'option camera = "left" should be a valid integer'),
+        (
+            "train.options.snapshot_second=9",
+            "unknown setting 'snapshot_second'; did you mean",
+        ),
+        ("train.options.snapshot_seconds='9'", 'snapshot_seconds = "9" should be a valid number'),
         ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
     ],
 )
@@ -172,6 +188,35 @@ def test_a_workspace_is_not_created_with_a_class_that_cannot_be_used(
     assert (code, out, err.count("\n")) == (ConfigError.exit_code, "", 1)
     assert words in err
     assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            "{snapshot_second = 9.0}",
+            "unknown setting 'snapshot_second'; did you mean",
+        ),
+        ("{scale_range = [0.9]}", "train.options.scale_range = [0.9] should have more entries"),
+        ("{flip_probability = 2}", "train.options.flip_probability = 2 should be less than or"),
+        ("{scale_range = [1.1, 0.9]}", "scale_range [1.1, 0.9] is not an ascending range above 0"),
+    ],
+)
+def test_further_settings_of_the_trainer_are_checked_before_any_work(
+    curate: Curate, workspace: Workspace, options: str, words: str
+) -> None:
+    """Also by --dry-run, before a training that is due only after hours."""
+    edit(
+        workspace,
+        ("support.toys:ToyDetector", "pillars"),
+        ("\npath = ", "\n# path = "),
+        ("options = {}\n\n[run]", f"options = {options}\n\n[run]"),
+    )
+    for command in (
+        ("pretrain",), ("pretrain", "--dry-run"), ("train-round", "--dry-run"), ("run",),
+        ("run", "--dry-run"),
+    ):  # fmt: skip
+        assert words in fails_before_any_work(curate, workspace, *command)
 
 
 def test_a_query_does_not_import_unneeded_classes(

@@ -37,6 +37,7 @@ from curate.files.paths import StrPath
 from curate.files.text import read_lines, read_text
 from curate.frames import Frame, FrameFiles, RotationY
 from curate.geometry.mounting import check_rotation_y
+from curate.ranges import Count
 from curate.shapes import Float32
 
 _log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class KittiDataset:
         root: StrPath,
         *,
         layout: PointLayout = UNDECLARED,
-        camera: int | None = None,
+        camera: Count | None = None,
         image_size: Sequence[int] | None = None,
         follow_links: bool = False,
         rotation_y: RotationY | None = None,

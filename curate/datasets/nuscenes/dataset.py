@@ -34,6 +34,7 @@ from curate.errors import ConfigError, DataError
 from curate.files.paths import StrPath
 from curate.frames import Camera, Frame, FrameFiles
 from curate.geometry.similarity import Similarity
+from curate.ranges import Count
 
 _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
@@ -68,7 +69,7 @@ class NuScenesDataset:
         camera: str | None = None,
         cameras: str | Sequence[str] | None = None,
         rename: Mapping[str, str] | None = None,
-        minimum_points: int = 1,
+        minimum_points: Count = 1,
         follow_links: bool = False,
     ) -> None:
         self.root = Path(root)

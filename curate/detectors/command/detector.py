@@ -33,6 +33,8 @@ from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotation_y_of_tools
 from curate.geometry.similarity import Similarity
+from curate.option_values import describe_wrong_values
+from curate.ranges import AboveZero, Share
 from curate.spelling import did_you_mean
 
 PLACEHOLDERS = ("clouds", "data", "results", "frames", "teacher", "round")
@@ -76,13 +78,13 @@ class CommandDetector:
     def __init__(
         self,
         path: StrPath | None,
-        minimum_score: float = 0.0,
+        minimum_score: Share = 0.0,
         *,
         command: str = "",
         results: Mapping[str, Any] | None = None,
         files: Sequence[str] = (),
         camera_view: bool = False,
-        timeout_s: float = 3600.0,
+        timeout_s: AboveZero = 3600.0,
         open_dataset: Callable[[], Dataset],
         folder: StrPath = ".",
         round_number: int = 1,
@@ -315,7 +317,7 @@ def _check_placeholders(command: UserCommand) -> None:
 
 
 def _check_results(results: Mapping[str, Any]) -> None:
-    """Raise ConfigError if `detector.options.results` has an unknown key or an invalid kind."""
+    """Raise ConfigError if `detector.options.results` has an unknown key or a wrong value."""
     names = ["path", *(each for each in inspect.signature(RecordedDetector).parameters)]
     known = [name for name in dict.fromkeys(names) if name not in _GIVEN or name == "path"]
     for key in results:
@@ -324,6 +326,8 @@ def _check_results(results: Mapping[str, Any]) -> None:
             raise ConfigError(
                 f"detector.options.results has no '{key}'{hint}; it has {', '.join(known)}"
             )
+    if wrong := describe_wrong_values(RecordedDetector, results):
+        raise ConfigError(f"detector.options.results.{wrong}")
     with results_options_named():
         check_kind(results.get("kind", "auto"))
     pattern = results.get("path", ".")

@@ -13,6 +13,7 @@ from curate.errors import ConfigError, DataError, first_line
 from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
+from curate.ranges import AtLeastOne, NotNegative, Share
 from curate.warnings_once import warn_once
 
 if TYPE_CHECKING:
@@ -56,9 +57,9 @@ class OpenPCDetDetector:
         *,
         config: StrPath | None = None,
         device: str = "cpu",
-        minimum_score: float = 0.1,
-        threads: int = 1,
-        lidar_height: float = MODEL_HEIGHT,
+        minimum_score: Share = 0.1,
+        threads: AtLeastOne = 1,
+        lidar_height: NotNegative = MODEL_HEIGHT,
     ) -> None:
         import torch
 

@@ -123,6 +123,11 @@ class PooledLevel(nn.Module):
             cells: (m, 4) int64 frame and cell z, y, x of the points.
             points: (m, 3) x, y, z, metres.
         """
+        # In half precision a coordinate of 50 m is rounded to 3 cm, and a variance may be negative.
+        with torch.autocast(points.device.type, enabled=False):
+            return self._pool(level, centres, cells, points)
+
+    def _pool(self, level: SparseTensor, centres: Tensor, cells: Tensor, points: Tensor) -> Tensor:
         (reach,), (radius,) = self.config.query_ranges, self.config.pool_radius
         most = self.config.nsample[0]
         near = near_voxels(level.sites, centres, cells, points, reach, radius, most)
@@ -130,7 +135,7 @@ class PooledLevel(nn.Module):
         matrix, shift = self._position(centres, near, points)
         # Coordinates from the middle of the scene keep the products small.
         middle = centres.mean(dim=0) if len(centres) else points.new_zeros(3)
-        rows = self.mlps_in[0](level.features) + (centres - middle) @ matrix.t()
+        rows = self.mlps_in[0](level.features.float()) + (centres - middle) @ matrix.t()
         highest = NearMaximum.apply(rows, near)  # type: ignore[no-untyped-call]
         position = torch.where(empty, 0.0, (points - middle) @ matrix.t())
         pooled = functional.relu(highest - position + shift)

@@ -36,6 +36,7 @@ from curate.files.paths import StrPath
 from curate.frames import Frame
 from curate.geometry.ground import GroundMap
 from curate.geometry.nms import nms_bev
+from curate.ranges import AtLeastOne, Share
 
 if TYPE_CHECKING:
     from curate.detectors.pillars.training import PillarStudent
@@ -76,9 +77,9 @@ class PillarDetector:
         checkpoint: StrPath,
         *,
         device: str = "cpu",
-        minimum_score: float = 0.1,
-        nms_iou: float = 0.1,
-        threads: int = 1,
+        minimum_score: Share = 0.1,
+        nms_iou: Share = 0.1,
+        threads: AtLeastOne = 1,
         precision: Precision = FLOAT32,
         providers: Providers = AUTO,
         provider_options: ProviderOptions | None = None,

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import check_rotation_y
 from curate.geometry.similarity import Similarity
+from curate.ranges import Share
 from curate.warnings_once import warn_once
 
 # Formats that store the augmented copies in the same file.
@@ -37,6 +38,7 @@ _TABLES: Mapping[str, Callable[[Path, bool], "Record"]] = {
     "parquet": lambda path, _: ParquetRecord.read(path),
 }
 
+Axes = Literal["forward-left", "right-forward"]
 # Transforms from these axes to the LiDAR frame of this project (x forward, y left).
 _AXES = {
     "forward-left": Similarity(),
@@ -125,17 +127,17 @@ class RecordedDetector:
     def __init__(
         self,
         path: StrPath,
-        minimum_score: float = 0.0,
+        minimum_score: Share = 0.0,
         *,
         kind: str = "auto",
         passes: Sequence[Mapping[str, Any]] = (),
         classes: Sequence[str] = (),
         frame_list: str | None = None,
         rename: Mapping[str, str] | None = None,
-        axes: str = "forward-left",
+        axes: Axes = "forward-left",
         rotation_y: RotationY | None = None,
         version: str | None = None,
-        ignored: str = "drop",
+        ignored: Literal["drop", "keep"] = "drop",
         shift: Sequence[float] = (0.0, 0.0, 0.0),
         frame_name: str | None = None,
         sigmoid: bool = False,

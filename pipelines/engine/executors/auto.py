@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from statistics import median
 
+from curate.ranges import AtLeastOne
 from pipelines.engine.executors.base import (
     FunctionHolder,
     Job,
@@ -42,7 +43,7 @@ class AutoExecutor:
             allow fewer: each worker needs about as much as this process with the model loaded.
     """
 
-    def __init__(self, workers: int | None = None) -> None:
+    def __init__(self, workers: AtLeastOne | None = None) -> None:
         self._limit = usable_cores() if workers is None else workers
         self._pool: ProcessExecutor | None = None
 

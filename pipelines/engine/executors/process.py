@@ -17,6 +17,7 @@ from threading import Thread
 from typing import Any
 
 from curate.errors import CurateError
+from curate.ranges import AtLeastOne
 from pipelines.engine.executors.base import (
     FunctionHolder,
     Job,
@@ -40,7 +41,7 @@ class ProcessExecutor:
         workers: number of processes; None for one per usable core.
     """
 
-    def __init__(self, workers: int | None = None) -> None:
+    def __init__(self, workers: AtLeastOne | None = None) -> None:
         self.workers = usable_cores() if workers is None else workers
         self._workers: list[_Worker] = []
 

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from curate.errors import ConfigError, CurateError, DataError, one_line
+from curate.ranges import AboveZero, AtLeastOne, NotNegative
 from pipelines.engine.executors.base import (
     FunctionHolder,
     Job,
@@ -51,12 +52,12 @@ class RayExecutor:
 
     def __init__(
         self,
-        workers: int | None = None,
+        workers: AtLeastOne | None = None,
         *,
         address: str | None = None,
-        num_cpus: float = 1.0,
-        num_gpus: float = 0.0,
-        start_timeout_s: float = 120.0,
+        num_cpus: NotNegative = 1.0,
+        num_gpus: NotNegative = 0.0,
+        start_timeout_s: AboveZero = 120.0,
     ) -> None:
         self.start_timeout_s = start_timeout_s
         self._ray = import_ray()

@@ -17,7 +17,7 @@ from support.toys import ToyImageSegmenter
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import DataError
 from curate.segmenters.base import SemanticMap
-from curate.segmenters.map_store import MapStore, StoringSegmenter
+from curate.segmenters.map_store import MapStore, StoringSegmenter, shown_size
 from curate.warnings_once import warn_once
 
 CLASSES = {"Car": (7,), "Cyclist": (2, 15)}
@@ -131,10 +131,22 @@ def test_a_full_folder_takes_no_further_map(
         other.write(f"{len(list(tmp_path.rglob('*.gz'))):064x}", a_map(20, 20))
     store.write(IMAGE, a_map())
     assert store.read(IMAGE, (9, 6)) is None
-    assert "1e-06 GiB, the limit segmenter.cache_limit: raise it in curate.toml" in caplog.text
+    assert store.unstored == 1
+    assert "take 1.049 KiB, the limit segmenter.cache_limit: raise it in curate.toml" in caplog.text
     roomy = store_at(tmp_path)
     roomy.write(IMAGE, a_map())
     assert roomy.read(IMAGE, (9, 6)) is not None
+
+
+@pytest.mark.parametrize(
+    ("size", "shown"),
+    [
+        (700, "700 bytes"), (1 << 10, "1 KiB"), (1.5 * (1 << 20), "1.5 MiB"), (20 << 30, "20 GiB"),
+        (1e-5 * (1 << 30), "10.49 KiB"), (1 << 40, "1024 GiB"),
+    ],
+)  # fmt: skip
+def test_a_size_is_shown_in_a_unit_that_fits(size: float, shown: str) -> None:
+    assert shown_size(size) == shown
 
 
 def test_a_map_that_cannot_be_stored_is_reported_once(
@@ -217,6 +229,7 @@ def test_a_map_of_a_wrong_size_is_returned_but_not_stored(
     frame = KittiDataset(toy_kitti).read("000000", points=False)
     assert toy.segment(frame) is small
     assert not toy.store.root.exists()
+    assert toy.store.unstored == 1
 
 
 def test_a_missing_image_is_an_error(toy: StoringSegmenter, toy_kitti: Path) -> None:

@@ -177,22 +177,25 @@ if __name__ == "__main__":
 
 
 def test_no_process_survives_a_killed_caller(make_labels: Labels, tmp_path: Path) -> None:
-    """SIGKILL for the calling process while the others train."""
+    """SIGKILL for the calling process while the others train; nothing is left to clean up."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     started = subprocess.Popen(
         [sys.executable, program, make_labels(labeled=2), tmp_path / "a.txt"],
         env=environment(**{DELAY_S: "0.05"}),
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         cwd=ROOT,
     )
     assert started.stdout is not None
-    with started.stdout:
+    assert started.stderr is not None
+    with started.stdout, started.stderr:
         assert started.stdout.readline() == b"1\n"
         below = descendants(started.pid)
         assert len(below) >= 2
         started.send_signal(signal.SIGKILL)
         started.wait()
+        assert started.stderr.read() == b""  # ends when the last process has ended
     end = time.monotonic() + 30
     while any(map(_runs, below)) and time.monotonic() < end:
         time.sleep(0.05)

@@ -21,6 +21,7 @@ from curate.training.loop import one_cycle
 from curate.training.settings import TrainingSettings
 from curate.training.snapshot import snapshot_path
 from curate.training.trainer import train as train_detector
+from curate.warnings_once import NOTES
 
 
 def quick(tiny, **changes):
@@ -109,16 +110,19 @@ def test_statistics_are_recorded_every_few_steps_and_at_the_end(make_labels, tin
 
 
 @pytest.mark.parametrize("teacher", ["student", "ema"])
-def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path, teacher):
-    """Killed after step 4 and called again, it resumes there."""
+def test_a_killed_training_ends_with_the_same_weights(make_labels, tiny, tmp_path, teacher, caplog):
+    """Killed after step 4 and called again, it resumes there, and says so."""
+    caplog.set_level(logging.INFO, logger=NOTES)
     labels, settings = make_labels(labeled=3, unlabeled=2), quick(tiny, teacher=teacher)
     whole, killed = tmp_path / "whole.safetensors", tmp_path / "killed.safetensors"
     whole_report = train(labels, whole, settings)
     with pytest.raises(Killed):
         train(labels, killed, settings, progress=kill_at(5))
     assert not killed.exists()
+    assert not caplog.messages
     report = train(labels, killed, settings)
     assert report.resumed_at == 4
+    assert caplog.messages == ["killed: the training resumes from step 4 of 6"]
     assert report.loss == whole_report.loss
     assert_same_weights(whole, killed)
     assert not snapshot_path(killed).exists()

@@ -220,9 +220,24 @@ def test_a_full_folder_ends_the_stage_early_and_loses_nothing(
     assert "nothing is lost" in caplog.text
     stored = len(maps(segmented))
     assert 0 < stored < 6
+    assert done["segment"] == stored
     assert run_workspace(full)[0].done == 0
     # A map that did not fit while its frame was in work is made by the next stage that reads it.
     assert [each.done for each in run_workspace(trained(segmented), 2) if each.stage == "segment"]
+    assert len(maps(segmented)) == 6
+
+
+def test_frames_that_were_in_work_when_the_folder_was_full_are_not_done(
+    segmented: Workspace, curate: Curate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Several workers have jobs while the limit is reached: their maps are made, but not stored."""
+    monkeypatch.setattr("curate.segmenters.map_store._PAUSE", 0)
+    monkeypatch.setattr("pipelines.engine.runner._until_refused", lambda jobs, *_: jobs)
+    full = segmented.with_settings("segmenter", cache_limit=1e-7)
+    assert (run(full)["segment"], len(maps(segmented))) == (1, 1)
+    assert len(set(calls(segmented))) == 6
+    out = curate("segment", "-w", segmented.root)[1]  # with the limit of curate.toml
+    assert "5 frames done" in out
     assert len(maps(segmented)) == 6
 
 

@@ -59,8 +59,9 @@ class _Convolution(nn.Module):
 
     def convolve(self, features: Tensor, rulebook: Rulebook) -> SparseTensor:
         """Return the features of the rulebook's outputs."""
+        weights = self.weight.flatten(1, 3).permute(1, 2, 0).contiguous()
         output: Tensor = _SparseConvolution.apply(  # type: ignore[no-untyped-call]
-            features, self.weight.flatten(1, 3).permute(1, 2, 0).contiguous(), rulebook
+            _autocast(features), _autocast(weights), rulebook
         )
         return SparseTensor(output, rulebook.after)
 
@@ -103,6 +104,12 @@ class InverseConvolution(_Convolution):
             strided: rulebook of the strided convolution.
         """
         return self.convolve(tensor.features, strided.inverse())
+
+
+def _autocast(tensor: Tensor) -> Tensor:
+    """Return a tensor in the type of mixed precision; torch casts only for its own functions."""
+    kind = tensor.device.type
+    return tensor.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else tensor
 
 
 def _uniform_bounds(fan_in: int) -> tuple[float, float]:
