@@ -58,6 +58,23 @@ def test_two_rounds_with_a_fine_tuned_checkpoint(
     assert [row["round"] for row in rows] == [1, 2]
 
 
+def test_two_rounds_from_a_preset(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
+    """Pretrain, predict, repredict, score, solve, export and train; twice, without a checkpoint."""
+    work = tmp_path / "work"
+    code, _, err = curate(
+        "init", work, "--root", toy_kitti, "--labeled", "0.25", "--detector", "voxel-rcnn-small",
+        "--set", "detector.minimum_score=0.1", "--set", "solve.self_paced=false",
+        "--set", "train.pretrain_steps=2", "--set", "train.round_steps=2", "--set", "run.rounds=2",
+    )  # fmt: skip
+    assert code == 0, err
+    code, _, err = curate("run", "--allow-empty", "-w", work)
+    assert code == 0, err
+    checkpoints = sorted(path.name for path in (work / "checkpoints").iterdir())
+    assert checkpoints == ["round-00.pth", "round-01-pspsl.pth", "round-02-pspsl.pth"]
+    state = torch.load(work / "checkpoints" / checkpoints[-1], weights_only=True)
+    assert json.loads(state["config"])["MODEL"]["ROI_HEAD"]["SCORE"] == "both"
+
+
 def test_a_changed_model_file_makes_predictions_outdated(
     curate: Curate, tmp_path: Path, toy_kitti: Path, files: tuple[Path, Path]
 ) -> None:
