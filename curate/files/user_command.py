@@ -28,7 +28,7 @@ _PLACEHOLDER = re.compile(r"\{([A-Za-z_]\w*)\}")
 # Text that a shell would not interpret, or that another shell gets: sh -c "$0 && b".
 _LITERAL = re.compile(r"""'[^']*'|\\.|(?<!\S)-\w*c\s+"(?:\\.|[^"\\])*\"""")
 _DOUBLE_QUOTED = re.compile(r'"(?:\\.|[^"\\])*"')
-_VARIABLE = re.compile(r"\$(?:\w+|\{\w+[^}]*\}|\()|`|(?<![^\s:])~(?=[/\s]|\Z)|\A\s*\w+=")
+_VARIABLE = re.compile(r"\$(?:\w+|\{\w+[^}]*\}|\()|`|(?<![^\s:])~(?=[/\s]|\Z)|\A\s*\w+=\S*")
 _OPERATOR = re.compile(r"(?<!\S)(?:&&|\|\|?|&|;|\d?>+(?:&\d|[^\s&]*)|&>\S*|<\S*)(?!\S)|;(?!\S)")
 # An interpreter that is followed by its script, perhaps after options without a value.
 _INTERPRETER = re.compile(

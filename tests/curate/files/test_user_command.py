@@ -95,7 +95,7 @@ def test_a_program_is_looked_for_before_it_is_needed(tmp_path: Path) -> None:
         ("python ${HOME}/infer.py", "${HOME}"),
         ("infer $(cat list)", "$("),
         ("infer `cat list`", "`"),
-        ("CUDA_VISIBLE_DEVICES=1 python infer.py", "CUDA_VISIBLE_DEVICES="),
+        ("CUDA_VISIBLE_DEVICES=1 python infer.py", "CUDA_VISIBLE_DEVICES=1"),
     ],
 )
 def test_shell_syntax_is_reported_with_what_to_write(text: str, found: str, tmp_path: Path) -> None:
