@@ -6,8 +6,8 @@ accepted and not used.
 
 Source: the model files of OpenPCDet (Shi et al., github.com/open-mmlab/OpenPCDet) for KITTI.
 
-Two keys are curate's own: `BACKBONE_3D.CHANNELS`, the widths of the sparse backbone, which cannot be
-chosen in OpenPCDet, and `ROI_HEAD.SCORE`, what the score of Voxel R-CNN is.
+Two keys are curate's own: `BACKBONE_3D.CHANNELS`, the widths of the sparse backbone, which are
+fixed in OpenPCDet, and `ROI_HEAD.SCORE`, what the score of Voxel R-CNN is.
 """
 
 from collections.abc import Mapping, Sequence
