@@ -550,6 +550,7 @@ def check_training_options(config: Config) -> None:
         )
     if wrong := describe_wrong_values(TrainingSettings, options):
         raise ConfigError(f"train.options.{wrong}")
+    TrainingSettings(**options)
 
 
 def check_extensions(config: Config, root: Path) -> None:

@@ -143,11 +143,13 @@ def _check_options(section: str, place: ModelPlace | None, options: ProviderOpti
     Raises:
         ConfigError: if the configured class runs no model in ONNX Runtime.
     """
-    if options and place is None:
+    if not options:
+        return
+    if place is None:
         raise ConfigError(_NOT_IN_RUNTIME)
-    if options and place and place.device is not None:
+    if place.device is not None:
         warn_once(f"{section}.provider_options have no effect: the model runs in {place}")
-    elif place:
+    else:
         for problem in ignored_options(place.providers, options):
             warn_once(f"{section}.provider_options: {problem}")
 

@@ -293,14 +293,20 @@ def trainable_names() -> list[str]:
 
 
 def detector_and_preset(name: str) -> tuple[str, str | None]:
-    """Return a detector's name and its preset; the name of a preset selects its detector."""
+    """Return a detector's name and its preset; the name of a preset selects its detector.
+
+    Raises:
+        ConfigError: if there is neither a detector nor a preset with the name.
+    """
     if name in DETECTORS.classes or ":" in name:
         return name, None
-    for owner in trainable_names():
-        found = trainable(owner)
-        if found is not None and name in found.presets:
-            return owner, name
-    return name, None
+    owners = {
+        preset: owner
+        for owner in reversed(trainable_names())  # of equal names, the first one counts
+        for preset in DETECTORS.load(owner).presets
+    }
+    DETECTORS.check_name(name, *owners)
+    return owners[name], name
 
 
 def _keywords(

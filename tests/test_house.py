@@ -20,10 +20,10 @@ MAY_IMPORT = {
 # The subpackages of each package, from the bottom up: each imports only those before it.
 LAYERS = {
     "curate": (
-        "shapes", "errors", "spelling", "warnings_once", "files", "frames", "geometry",
-        "detections", "consistency", "datasets", "category_names", "simulation", "segmenters",
-        "priors", "weighting", "evaluation", "exporters", "detectors", "firewall", "viewing",
-        "review", "training", "__main__",
+        "shapes", "ranges", "errors", "spelling", "warnings_once", "files", "option_values",
+        "frames", "geometry", "detections", "consistency", "datasets", "category_names",
+        "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
+        "firewall", "viewing", "review", "training", "__main__",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "devices", "assembly", "category_names", "engine",

@@ -28,7 +28,7 @@ _PLACEHOLDER = re.compile(r"\{([A-Za-z_]\w*)\}")
 # Text that a shell would not interpret, or that another shell gets: sh -c "$0 && b".
 _LITERAL = re.compile(r"""'[^']*'|\\.|(?<!\S)-\w*c\s+"(?:\\.|[^"\\])*\"""")
 _DOUBLE_QUOTED = re.compile(r'"(?:\\.|[^"\\])*"')
-_VARIABLE = re.compile(r"\$(?:\w+|\{\w+[^}]*\}|\()|`|(?<![^\s:])~(?=[/\s]|\Z)|\A\s*\w+=")
+_VARIABLE = re.compile(r"\$(?:\w+|\{\w+[^}]*\}|\()|`|(?<![^\s:])~(?=[/\s]|\Z)|\A\s*\w+=\S*")
 _OPERATOR = re.compile(r"(?<!\S)(?:&&|\|\|?|&|;|\d?>+(?:&\d|[^\s&]*)|&>\S*|<\S*)(?!\S)|;(?!\S)")
 # An interpreter that is followed by its script, perhaps after options without a value.
 _INTERPRETER = re.compile(
@@ -115,7 +115,7 @@ class UserCommand:
             folder: the folder in which the command runs.
         """
         program = self.arguments[0]
-        path = folder / program if os.sep in program else Path(program)
+        path = path_from(folder, program) if os.sep in program else Path(program)
         if _PLACEHOLDER.search(program) or shutil.which(path):
             return
         if os.sep not in program:
@@ -132,7 +132,7 @@ class UserCommand:
         script = next((each for each in rest if not _FLAG.fullmatch(each)), "-")
         if script.startswith("-") or _PLACEHOLDER.search(script):
             return
-        if _INTERPRETER.fullmatch(Path(program).name) and not (folder / script).exists():
+        if _INTERPRETER.fullmatch(Path(program).name) and not path_from(folder, script).exists():
             raise ConfigError(f"{self.title}: {describe_missing(script, folder)}")
 
     def filled(self, values: Mapping[str, str]) -> list[str]:
@@ -185,11 +185,17 @@ def fill(text: str, values: Mapping[str, str]) -> str:
     return _PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), text)
 
 
+def path_from(folder: Path, name: str) -> Path:
+    """Return a path that starts at a folder; ".." also leads out of one that does not exist yet."""
+    path = folder / name
+    return path if folder.exists() else Path(os.path.normpath(path))
+
+
 def describe_missing(name: str, folder: Path) -> str:
     """Return that a path from a folder does not exist, and that it does from the current one."""
     here = Path(name).absolute()
     hint = f"; paths are relative to the workspace, write {here}" if here.exists() else ""
-    return f"{folder / name}: no such file{hint}"
+    return f"{path_from(folder, name)}: no such file{hint}"
 
 
 def describe_end(code: int) -> str:

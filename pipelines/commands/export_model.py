@@ -36,6 +36,6 @@ def export_model(
     if as_json:
         print_json(found)
         return
-    print_line(f"{found.checkpoint} in {found.output}")
+    print_line(f"{found.output}, from {found.checkpoint}")
     for line in found.usage:
         print_line(line, indent=2)

@@ -219,7 +219,7 @@ def _check_place(workspace: Workspace, folder: Path) -> None:
     workspaces = [workspace.root] if workspace.root.is_relative_to(data) else []
     if path.is_relative_to(data) and not any(map(path.is_relative_to, workspaces)):
         raise ConfigError(
-            f"{folder}: is in the data set {data}, whose readers could take the copies for frames; "
+            f"{folder}: is in the data set {data}, where the copies could be read as frames; "
             "choose a folder outside"
         )
     existing = _existing(folder)

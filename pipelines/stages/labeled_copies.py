@@ -1,7 +1,7 @@
 """Turned copies of labeled frames, in which a command shows how its headings are meant.
 
 If the camera looks along x, all meanings of rotation_y agree in the frames themselves, but not in
-copies that are turned. The labels say what is right, before anything is predicted in earnest.
+copies that are turned. They are compared with the labels before any prediction is stored.
 """
 
 from collections.abc import Mapping, Sequence

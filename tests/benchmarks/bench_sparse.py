@@ -133,7 +133,7 @@ def bench_backbone(benchmark, network, voxels):
 
 
 def bench_backbone_in_spconv(benchmark, network, voxels):
-    """The same in spconv, whose CPU code is only safe with one thread."""
+    """Measure the same in spconv; its CPU code is only safe with one thread."""
     peer = Peer(network.backbone_3d).eval()
     with torch.inference_mode():
         found = measure(

@@ -190,7 +190,7 @@ def test_a_frame_with_wrong_points_fails_alone(
         ("openpcdet", {"preset": "second-small"}, "the probability of the category"),
         ("openpcdet", {"preset": "voxel-rcnn-small"}, "0 up to an IoU of 0.25, 1 from 0.75"),
         ("openpcdet", {"config": "SECONDNet"}, "the probability of the category"),
-        ("openpcdet", {"config": "VoxelRCNN"}, "the 3D IoU of the box with the object"),
+        ("openpcdet", {"config": "VoxelRCNN"}, "the 3D IoU of the box with the object ("),
         ("openpcdet", {"stored": True}, "the 3D IoU of the box with the object"),
         ("openpcdet", {"path": "gone.pth"}, None),
         ("onnx", {"path": "model.onnx"}, None),
@@ -221,12 +221,12 @@ def test_every_detector_says_what_its_score_estimates(
 
 def test_a_model_is_exported_to_onnx(curate: Curate, tmp_path: Path, toy_kitti: Path) -> None:
     """The newest checkpoint by default; the printed line uses it, and others say why not."""
-    work = tmp_path / "work"
+    work = tmp_path / "a work"
     begin(curate, work, toy_kitti, "--detector-path", write_files(tmp_path, "PointPillar"))
     code, out, err = curate("export-model", "-w", work)
     assert code == 0, err
     model = work / "exports" / "model.onnx"
-    assert f"{tmp_path / 'model.pth'} in {model}" in out
+    assert f"{model}, from {tmp_path / 'model.pth'}\n" in out
     flags = shlex.split(re.search(r"in curate: (--detector.*)", out)[1])
     other = tmp_path / "other"
     code, _, err = curate("init", other, "--root", toy_kitti, "--labeled", "0.25", *flags)

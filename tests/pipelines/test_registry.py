@@ -102,8 +102,16 @@ def test_a_class_that_accepts_any_option_gets_all_options(
         ("voxel-rcnn", ("openpcdet", "voxel-rcnn")),
         ("second-small", ("openpcdet", "second-small")),
         ("module:Class", ("module:Class", None)),
-        ("unknown", ("unknown", None)),
+        ("small", ("pillars", "small")),
     ],
 )
 def test_a_preset_names_its_detector(name: str, expected: tuple) -> None:
     assert detector_and_preset(name) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [("voxel-rcn", "voxel-rcnn"), ("pillar", "pillars"), ("kiti", "kitti")]
+)
+def test_a_misspelled_preset_is_suggested(name: str, meant: str) -> None:
+    with pytest.raises(ConfigError, match=f"unknown detector '{name}'.*did you mean '{meant}'"):
+        detector_and_preset(name)

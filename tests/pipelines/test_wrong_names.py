@@ -176,6 +176,7 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
             "train.options.snapshot_second=9",
             "unknown setting 'snapshot_second'; did you mean",
         ),
+        ("train.options.scale_range=[1.1,0.9]", "[1.1, 0.9] is not an ascending range above 0"),
         ("train.options.snapshot_seconds='9'", 'snapshot_seconds = "9" should be a valid number'),
         ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
     ],

@@ -28,7 +28,13 @@ from curate.detectors.recorded import RecordedDetector
 from curate.detectors.recorded.formats import SUFFIXES, check_kind
 from curate.errors import ConfigError, CurateError, DataError, ModelError, one_line
 from curate.files.paths import StrPath
-from curate.files.user_command import UserCommand, describe_end, describe_missing, fill
+from curate.files.user_command import (
+    UserCommand,
+    describe_end,
+    describe_missing,
+    fill,
+    path_from,
+)
 from curate.frames import Calibration, Frame, RotationY
 from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotation_y_of_tools
@@ -97,7 +103,7 @@ class CommandDetector:
         if isinstance(files, str):
             raise ConfigError(f'detector.options.files: write a list, ["{files}"]')
         for name in files:
-            if not (self._folder / name).exists():
+            if not path_from(self._folder, name).exists():
                 missing = describe_missing(name, self._folder)
                 raise ConfigError(f"detector.options.files: {missing}")
         self._path = "" if path is None else str(Path(path).absolute())

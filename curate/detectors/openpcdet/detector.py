@@ -1,5 +1,6 @@
 """PointPillar, SECOND and Voxel R-CNN: checkpoints of OpenPCDet, or trained by curate."""
 
+import shlex
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -126,7 +127,7 @@ class OpenPCDetDetector:
         learned = file.model.roi_head.target_config
         low, high = learned.cls_bg_thresh, learned.cls_fg_thresh
         overlap = (
-            f"the 3D IoU of the box with the object: 0 up to an IoU of {low:g}, 1 from {high:g}"
+            f"the 3D IoU of the box with the object (0 up to an IoU of {low:g}, 1 from {high:g})"
         )
         if file.model.roi_head.score == "both":
             return f"the geometric mean of the probability of the category and of {overlap}"
@@ -151,11 +152,12 @@ class OpenPCDetDetector:
             "nms_iou": network.file.model.post_processing.nms_config.nms_thresh,
             "nms_across": True,
         }
-        flags = f"--detector onnx --detector-path {output.resolve()}"
+        setting = f"detector.options={toml(own)}"
+        path = shlex.quote(str(output.resolve()))
         return (
             "in: points [n, 4] float32, x, y, z, intensity in [0, 1] in the LiDAR frame",
             "out: boxes [k, 7], scores [k] and labels [k], before suppression",
-            f"in curate: {flags} --set 'detector.options={toml(own)}'",
+            f"in curate: --detector onnx --detector-path {path} --set {shlex.quote(setting)}",
         )
 
     @property

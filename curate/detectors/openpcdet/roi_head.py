@@ -98,7 +98,8 @@ class RoIHead(nn.Module):
             sites = levels[name].sites
             centres = (sites.places[:, [3, 2, 1]].to(size) + 0.5) * (size * stride) + low
             parts.append(layer(levels[name], centres, cells, points.flatten(0, 1)))
-        return torch.cat(parts, dim=1).view(*points.shape[:2], -1)
+        pooled = torch.cat(parts, dim=1)
+        return pooled.view(*points.shape[:2], pooled.shape[1])  # there may be no proposals
 
 
 class PooledLevel(nn.Module):

@@ -6,8 +6,8 @@ accepted and not used.
 
 Source: the model files of OpenPCDet (Shi et al., github.com/open-mmlab/OpenPCDet) for KITTI.
 
-One key is curate's own: `BACKBONE_3D.CHANNELS`, the widths of the sparse backbone, which OpenPCDet
-does not let one choose.
+Two keys are curate's own: `BACKBONE_3D.CHANNELS`, the widths of the sparse backbone, which are
+fixed in OpenPCDet, and `ROI_HEAD.SCORE`, what the score of Voxel R-CNN is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -349,7 +349,8 @@ class RoILoss(_Section):
 class VoxelRCNNHead(_Section):
     """The second stage of Voxel R-CNN.
 
-    `score` is a key of curate: "both" multiplies the scores of both stages, see `inference`.
+    `score` is a key of curate: "roi" is the score of the second stage, "both" the geometric mean of
+    the scores of both stages; see `inference`.
     """
 
     name: Literal["VoxelRCNNHead"]

@@ -95,7 +95,7 @@ def test_a_program_is_looked_for_before_it_is_needed(tmp_path: Path) -> None:
         ("python ${HOME}/infer.py", "${HOME}"),
         ("infer $(cat list)", "$("),
         ("infer `cat list`", "`"),
-        ("CUDA_VISIBLE_DEVICES=1 python infer.py", "CUDA_VISIBLE_DEVICES="),
+        ("CUDA_VISIBLE_DEVICES=1 python infer.py", "CUDA_VISIBLE_DEVICES=1"),
     ],
 )
 def test_shell_syntax_is_reported_with_what_to_write(text: str, found: str, tmp_path: Path) -> None:
@@ -140,6 +140,8 @@ def test_relative_paths_start_at_the_folder_in_which_the_command_runs(
         UserCommand.parse("c", "./infer {clouds}").check(home)
     with pytest.raises(ConfigError, match=r"sh: .*missing\.sh: no such file$"):
         UserCommand.parse("sh", "bash missing.sh").check(home)
+    for command in ("python3 ../here/infer.py", "../here/infer", "sh -e ../here/infer"):
+        UserCommand.parse("c", command).check(tmp_path / "not yet there")
     for unknown in ("python3 -m infer", "python3 -X dev infer.py", "sh -c infer", "python3"):
         UserCommand.parse("c", unknown).check(home)
     tool = home / "bin" / "tool.sh"

@@ -334,6 +334,15 @@ def test_awkward_frames_have_a_finite_loss_with_gradients(name: str, case: str) 
     assert all(torch.isfinite(each).all() for each in gradients)
 
 
+@pytest.mark.parametrize("name", ["PointPillar", "SECONDNet", "VoxelRCNN"])
+def test_the_loss_of_weights_that_have_diverged_is_nan(name: str) -> None:
+    """The training ends with a message; without proposals, the second stage must not crash."""
+    student = student_of(name)
+    torch.nn.init.constant_(student.network.dense_head.conv_cls.bias, torch.nan)
+    frame = sample([CAR], ["Car"], [1])
+    assert torch.isnan(student.loss(student.encode([frame, frame], "cpu"), 3.0)["loss"])
+
+
 def test_a_checkpoint_of_openpcdet_is_fine_tuned_with_its_model_file(tmp_path: Path) -> None:
     """It belongs to no preset, and is saved with the model file."""
     path = write_files(tmp_path)
