@@ -115,6 +115,7 @@ def check_earlier_stages(plan: Plan, stages: Sequence[FramesStage], split: str) 
 
     Raises:
         WorkspaceError: if an earlier stage has not processed any of the frames that are left.
+        DatabaseError: if they wait for another process; the message says which one.
     """
     names = {stage.name for stage in stages}
     for stage in stages:
@@ -129,7 +130,9 @@ def check_earlier_stages(plan: Plan, stages: Sequence[FramesStage], split: str) 
                 f"{options}` first, or `curate run` for all stages"
             )
             if not plan.count_waiting(stage, split):
-                raise WorkspaceError(message)
+                # If another process is at work on these frames, its claim is the error.
+                with plan.workspace.database.claiming(_resources(plan, stage), stage.name):
+                    raise WorkspaceError(message)
             _log.warning("%s", message)
 
 
@@ -141,10 +144,8 @@ def run_frames(
     Raises:
         DatabaseError: if another process works on the round; the message says which one.
     """
-    database, number = plan.workspace.database, plan.round_of(stage)
-    # A cache stage may run beside the stages of all rounds.
-    resources = [Resource(f"stage {stage.name}")] if number == 0 else round_resources(number)
-    with database.claiming(resources, stage.name):
+    number = plan.round_of(stage)
+    with plan.workspace.database.claiming(_resources(plan, stage), stage.name):
         start = time.perf_counter()
         if stage.prepare:
             stage.prepare(plan.workspace)
@@ -176,6 +177,12 @@ def run_frames(
             seconds=time.perf_counter() - start,
             errors=tuple(writer.errors),
         )
+
+
+def _resources(plan: Plan, stage: FramesStage) -> Sequence[Resource]:
+    """Return what a stage of frames claims; a cache stage may run beside those of all rounds."""
+    number = plan.round_of(stage)
+    return [Resource(f"stage {stage.name}")] if number == 0 else round_resources(number)
 
 
 def run_round(plan: Plan, name: str, policy: str, progress: Progress) -> Report:

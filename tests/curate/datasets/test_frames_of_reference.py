@@ -139,5 +139,5 @@ def test_impossible_calibrations_are_rejected_with_their_file(kind: str, tmp_pat
 @pytest.mark.parametrize("kind", LAYOUTS)
 def test_an_unknown_meaning_of_rotation_y_is_rejected(kind: str, tmp_path: Path) -> None:
     LAYOUTS[kind](tmp_path, Rig())
-    with pytest.raises(ConfigError, match=r"dataset\.options\.rotation_y 'lidar': use one of cal"):
+    with pytest.raises(ConfigError, match=r"option rotation_y = \"lidar\" should be 'cal"):
         DATASETS.build(kind, tmp_path, offered={}, options={"rotation_y": "lidar"})

@@ -387,7 +387,7 @@ def test_a_batch_that_is_split_over_processes_has_the_same_loss_and_gradients(
 ) -> None:
     """Frames with one, two and no objects, on two processes; proposals are given, not drawn."""
     rois = torch.tensor([CAR, WALKER, (40.0, 9, -1, 4, 2, 1.5, 0)], dtype=torch.float64)
-    given = (rois + 0.02, torch.tensor([0, 1, 0]))
+    given = (rois + 0.02, torch.tensor([0, 1, 0]), torch.zeros(3))
     monkeypatch.setattr(training_module, "proposals", lambda *_: given)
     monkeypatch.setattr(targets_module, "_drawn", np.resize)
     monkeypatch.setattr(torch, "randperm", torch.arange)
