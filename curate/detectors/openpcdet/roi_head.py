@@ -136,7 +136,7 @@ class PooledLevel(nn.Module):
         matrix, shift = self._position(centres, near, points)
         # Coordinates from the middle of the scene keep the products small.
         middle = centres.mean(dim=0) if len(centres) else points.new_zeros(3)
-        rows = self.mlps_in[0](level.features.float()) + (centres - middle) @ matrix.t()
+        rows = self.mlps_in[0](level.features.to(points)) + (centres - middle) @ matrix.t()
         highest = NearMaximum.apply(rows, near)  # type: ignore[no-untyped-call]
         position = torch.where(empty, 0.0, (points - middle) @ matrix.t())
         pooled = functional.relu(highest - position + shift)
