@@ -44,6 +44,7 @@ def run_frame_command(
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import open_round, outside_rounds, preview_round
     from pipelines.engine.runner import (
+        check_claims,
         check_earlier_stages,
         check_inputs,
         open_executor,
@@ -84,6 +85,7 @@ def run_frame_command(
         context = replace(open_round(workspace, round_number), split=split)
         plan = Plan(workspace, context, graph)
     check_inputs(plan, selected, split)
+    check_claims(plan, selected)
     check_earlier_stages(plan, selected, split)
     reports = []
     with open_executor(workspace) as work:

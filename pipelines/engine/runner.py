@@ -110,12 +110,22 @@ def check_inputs(plan: Plan, stages: Iterable[Stage], split: str = "unlabeled") 
                 stage.ready(plan.workspace, plan.context, split)
 
 
+def check_claims(plan: Plan, stages: Iterable[FramesStage]) -> None:
+    """Check that no other process works on the round of the stages.
+
+    Raises:
+        DatabaseError: if one does; the message says which one.
+    """
+    for stage in stages:
+        with plan.workspace.database.claiming(_resources(plan, stage), stage.name):
+            pass
+
+
 def check_earlier_stages(plan: Plan, stages: Sequence[FramesStage], split: str) -> None:
     """Check that stages that run alone have frames to work on; warn of those that must wait.
 
     Raises:
         WorkspaceError: if an earlier stage has not processed any of the frames that are left.
-        DatabaseError: if they wait for another process; the message says which one.
     """
     names = {stage.name for stage in stages}
     for stage in stages:
@@ -130,9 +140,7 @@ def check_earlier_stages(plan: Plan, stages: Sequence[FramesStage], split: str) 
                 f"{options}` first, or `curate run` for all stages"
             )
             if not plan.count_waiting(stage, split):
-                # If another process is at work on these frames, its claim is the error.
-                with plan.workspace.database.claiming(_resources(plan, stage), stage.name):
-                    raise WorkspaceError(message)
+                raise WorkspaceError(message)
             _log.warning("%s", message)
 
 
