@@ -55,7 +55,7 @@ def assert_same(found: Detections, expected: Detections) -> None:
 
 
 def write(folder: Path, content: Mapping[str, Any]) -> Path:
-    """Write a checkpoint of random weights, whose scores spread over (0, 1), for a model file."""
+    """Write a checkpoint for a model file: random weights with scores all over (0, 1)."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = DetectionNetwork(parse_model_file(content, "test"))
