@@ -82,21 +82,19 @@ class TableRecord:
                 rows = _Rows(path, file)
                 order = _places(path, rows.header)
                 categories: set[str] = set()
-                runs = []
+                blocks = []
                 for block in rows.blocks(order):
-                    runs.append(_check_block(path, block, sigmoid))
+                    blocks.append(_check_block(path, block, sigmoid))
                     categories.update(row[1] for row in block.rows)
         except FileNotFoundError:
             raise DataError(f"{path}: no such file of recorded detections") from None
         except OSError as error:
             raise DataError(f"{path}: cannot be read as CSV: {one_line(error)}") from error
-        _check_repeated_rows(path, [(hashes, lines) for _, _, hashes, lines in runs])
-        names = np.concatenate([found for found, _, _, _ in runs] or [np.empty(0, dtype="S1")])
-        places = np.concatenate([found for _, found, _, _ in runs] or [np.empty((0, 3), np.int64)])
-        sort = np.argsort(names, kind="stable")
-        return cls(
-            path, rows.header, order, names[sort], places[sort], frozenset(categories), sigmoid
-        )
+        runs = _Runs.joined(blocks)
+        _check_repeated(path, runs.hashes, runs.places[:, 2])
+        sort = np.argsort(runs.names, kind="stable")
+        names, places = runs.names[sort], runs.places[sort]
+        return cls(path, rows.header, order, names, places, frozenset(categories), sigmoid)
 
     @property
     def has_views(self) -> bool:
@@ -160,6 +158,34 @@ class _Block:
 
     rows: Sequence[Sequence[str]]
     places: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of consecutive rows of the same frame, in the order of the file.
+
+    Attributes:
+        names: (n,) the frame of each run, as UTF-8.
+        places: (n, 3) first byte, end byte and first line of each run.
+        hashes: (n,) int64, the sum of the hashes of its rows.
+    """
+
+    names: np.ndarray
+    places: np.ndarray
+    hashes: np.ndarray
+
+    @classmethod
+    def joined(cls, blocks: Sequence["_Runs"]) -> "_Runs":
+        """Return the runs of all blocks; a run that a block ended goes on in the next one."""
+        if not blocks:
+            return cls(np.empty(0, "S1"), np.empty((0, 3), np.int64), np.empty(0, np.int64))
+        names = np.concatenate([each.names for each in blocks])
+        places = np.concatenate([each.places for each in blocks])
+        hashes = np.concatenate([each.hashes for each in blocks])
+        first = _first_of_runs(names)
+        ends = places[_last_of_runs(first, names), 1]
+        places = np.column_stack([places[first, 0], ends, places[first, 2]])
+        return cls(names[first], places, np.add.reduceat(hashes, first))
 
 
 class _Rows:
@@ -227,37 +253,52 @@ def _in_order(order: Sequence[int | None]) -> Callable[[list[str]], Sequence[str
     return lambda row: chosen([*row, *defaults])
 
 
-def _check_block(
-    path: Path, block: _Block, sigmoid: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Check the rows of a block.
-
-    Returns:
-        Frame and place of each run of consecutive rows, and hash and line of each row.
+def _check_block(path: Path, block: _Block, sigmoid: bool) -> _Runs:
+    """Check the rows of a block and return its runs.
 
     Raises:
-        DataError: if a row has an invalid value.
+        DataError: if a row has an invalid value or occurs twice.
     """
     lines = block.places[:, 2]
     numbers = _numbers(path, block.rows, lines.tolist(), sigmoid)
     _views_of(path, block.rows, lines.tolist(), numbers)
+    hashes = np.fromiter(
+        (
+            hash((row[0], row[1], values.tobytes()))
+            for row, values in zip(block.rows, numbers, strict=True)
+        ),
+        np.int64,
+        len(numbers),
+    )
+    _check_repeated(path, hashes, lines)
     names = np.array([row[0].encode() for row in block.rows])
-    first = np.flatnonzero(np.append(True, names[1:] != names[:-1]))
-    last = np.append(first[1:], len(names)) - 1
-    begin, end, line = block.places[first, 0], block.places[last, 1], block.places[first, 2]
-    hashes = [
-        hash((row[0], row[1], values.tobytes()))
-        for row, values in zip(block.rows, numbers, strict=True)
-    ]
+    first = _first_of_runs(names)
+    last = _last_of_runs(first, names)
+    begin, end, line = block.places[first, 0], block.places[last, 1], lines[first]
     places = np.column_stack([begin, end, line])
-    return names[first], places, np.array(hashes, dtype=np.int64), lines
+    return _Runs(names[first], places, np.add.reduceat(hashes, first))
 
 
-def _check_repeated_rows(path: Path, blocks: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Raise DataError if two rows have the same hash, as in a file that was appended to itself."""
-    if not blocks:
-        return
-    hashes, lines = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+def _first_of_runs(names: np.ndarray) -> np.ndarray:
+    """Return the index of the first of consecutive equal names."""
+    return np.flatnonzero(np.append(True, names[1:] != names[:-1]))
+
+
+def _last_of_runs(first: np.ndarray, names: np.ndarray) -> np.ndarray:
+    """Return the index of the last of consecutive equal names."""
+    return np.append(first[1:], len(names)) - 1
+
+
+def _check_repeated(path: Path, hashes: np.ndarray, lines: np.ndarray) -> None:
+    """Raise DataError if two hashes are the same, as in a file that was appended to itself.
+
+    Args:
+        path: the file, for messages.
+        hashes: (n,) of the rows of a block, or of the runs of the file: a hash for each of its rows
+            would need more memory than all else. A row that occurs again far away in another run of
+            its frame is found when the frame is read.
+        lines: (n,) their lines.
+    """
     order = np.argsort(hashes, kind="stable")
     again = np.flatnonzero(hashes[order][1:] == hashes[order][:-1])
     if len(again):

@@ -8,6 +8,7 @@ from support.toys import empty_frame
 
 from curate.detectors.base import RecordedViews
 from curate.detectors.recorded import RecordedDetector
+from curate.detectors.recorded.table import BLOCK_ROWS
 from curate.errors import DataError
 from curate.geometry.similarity import Similarity
 
@@ -74,6 +75,21 @@ def test_a_row_that_occurs_twice_is_rejected(tmp_path):
     assert len(RecordedDetector(path).predict(empty_frame("000001"))) == 4
     path.write_text(path.read_text() + f"{other.replace('0.9,', ' 0.90,')}\n{MOVED}\n")
     with pytest.raises(DataError, match=r"a\.csv:8: the same row as line 4; .* written twice"):
+        RecordedDetector(path)
+
+
+def test_a_long_file_that_was_appended_to_itself_is_rejected(tmp_path):
+    """The frames of its two halves are not divided into the same blocks of rows."""
+    rows = [
+        PLAIN.replace("000001", f"{frame:06d}").replace("12.0", f"{k}.5")
+        for frame in range(75)
+        for k in range(60)
+    ]
+    assert len(rows) > BLOCK_ROWS
+    path = write(tmp_path / "a.csv", *rows)
+    assert len(RecordedDetector(path).predict(empty_frame("000068"))) == 60
+    path = write(tmp_path / "b.csv", *rows, *rows)
+    with pytest.raises(DataError, match=r"b\.csv:4502: the same row as line 2; .* written twice"):
         RecordedDetector(path)
 
 
