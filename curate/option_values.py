@@ -10,7 +10,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from curate.files.toml_text import toml, toml_key
 
 _LONGEST = 80  # characters of a wrong value that are shown
-_ANY_TYPE = ConfigDict(arbitrary_types_allowed=True)
+_CHECKS = ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False)
 # Errors for types that no value of a configuration file has, such as an array or a function.
 _NOT_CHECKED = {"callable_type", "needs_python_object"}
 
@@ -53,7 +53,7 @@ def _describe(name: str, value: Any, annotation: Any) -> str:
     converted: neither "1" nor true is a number.
     """
     try:
-        adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=_ANY_TYPE)
+        adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=_CHECKS)
     except Exception:  # noqa: BLE001 - a user's annotation may be anything
         return ""
     try:

@@ -50,6 +50,15 @@ from pipelines.workspace.workspace import open_dataset, sha256
 
 Kind = TypeVar("Kind")
 
+# Settings of the trainer with a place of their own, so that train.options does not have them.
+_SET_ELSEWHERE = {
+    **{name: f"train.{name}" for name in TrainSection.model_fields},
+    "steps": "train.pretrain_steps and train.round_steps",
+    "learning_rate": "train.learning_rate and train.round_learning_rate",
+    "seed": "run.seed",
+    "device": "detector.device",
+}
+
 SHIPPED_SEGMENTER = Path(__file__).parent.parent / "curate/segmenters/models/simulated.onnx"
 
 
@@ -540,14 +549,15 @@ def check_training_options(config: Config) -> None:
     from curate.training.settings import TrainingSettings
 
     accepted = [field.name for field in dataclasses.fields(TrainingSettings)]
-    unknown = [name for name in options if name not in accepted]
-    if unknown:
-        elsewhere = {*TrainSection.model_fields, "steps", "seed", "device"}
-        names = [name for name in accepted if name not in elsewhere]
-        raise ConfigError(
-            f"train.options of curate.toml: unknown setting '{unknown[0]}'"
-            f"{did_you_mean(unknown[0], names)}; it accepts {', '.join(names)}"
-        )
+    names = [name for name in accepted if name not in _SET_ELSEWHERE]
+    for name in options:
+        if name in _SET_ELSEWHERE:
+            raise ConfigError(f"train.options.{name}: set {_SET_ELSEWHERE[name]} instead")
+        if name not in names:
+            raise ConfigError(
+                f"train.options of curate.toml: unknown setting '{name}'"
+                f"{did_you_mean(name, accepted)}; it accepts {', '.join(names)}"
+            )
     if wrong := describe_wrong_values(TrainingSettings, options):
         raise ConfigError(f"train.options.{wrong}")
     TrainingSettings(**options)

@@ -176,6 +176,13 @@ def test_an_option_of_the_command_line_is_checked_like_the_file(
             "train.options.snapshot_second=9",
             "unknown setting 'snapshot_second'; did you mean",
         ),
+        ("train.options.pastd=4", "unknown setting 'pastd'; did you mean 'pasted'?; it accepts"),
+        ("train.options.pasted=4", "train.options.pasted: set train.pasted instead"),
+        (
+            "train.options.steps=40",
+            "set train.pretrain_steps and train.round_steps instead",
+        ),
+        ("train.options.rotation_limit_rad=inf", "should be a finite number"),
         ("train.options.scale_range=[1.1,0.9]", "[1.1, 0.9] is not an ascending range above 0"),
         ("train.options.snapshot_seconds='9'", 'snapshot_seconds = "9" should be a valid number'),
         ("train.preset=kiti", "train.preset of detector 'pillars': unknown preset 'kiti'"),
