@@ -4,7 +4,8 @@ The results are not stored, because ground truth of X_u must never enter the dat
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from sqlalchemy import select
@@ -21,6 +22,19 @@ from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.workspace.workspace import Workspace, read_truth
 
 
+@dataclass(frozen=True)
+class JudgedLabels:
+    """Which labels of simulated frames are correct.
+
+    Attributes:
+        correct: whether a label is correct, by frame key and k; without neutral labels.
+        objects: number of objects of the frames.
+    """
+
+    correct: Mapping[tuple[int, int], bool]
+    objects: int
+
+
 def label_quality(
     workspace: Workspace, round_number: int, policies: Sequence[str]
 ) -> list[tuple[str, int, int, float, float, float]]:
@@ -30,6 +44,29 @@ def label_quality(
         Rows of policy, number of labels, number of labels with a weight above 0, weighted precision
         and weighted recall in percent, and AUROC; NaN for a figure that cannot be computed.
     """
+    judged = judge_labels(workspace, round_number)
+    rows = []
+    for policy in policies:
+        weights = _weights(workspace, round_number, policy)
+        counted = [label for label in weights if label in judged.correct]
+        v = np.array([weights[label] for label in counted])
+        above_zero = sum(weight > 0 for weight in weights.values())
+        is_correct = np.array([judged.correct[label] for label in counted], dtype=bool)
+        rows.append(
+            (
+                policy,
+                len(weights),
+                above_zero,
+                100 * weighted_precision(v, is_correct),
+                100 * weighted_recall(v, is_correct, judged.objects),
+                auroc(v, is_correct) if rank_labels(v) else math.nan,
+            )
+        )
+    return rows
+
+
+def judge_labels(workspace: Workspace, round_number: int) -> JudgedLabels:
+    """Compare the labels of a round with the label files of the simulation."""
     keys = workspace.frames("unlabeled")
     found = workspace.predictions(round_number, list(keys.values()))
     correct: dict[tuple[int, int], bool] = {}
@@ -47,24 +84,7 @@ def label_quality(
         objects += sum(matches.ground_truths.values())
         for k in np.flatnonzero(matches.counted):
             correct[key, int(k)] = bool(matches.correct[k])
-    rows = []
-    for policy in policies:
-        weights = _weights(workspace, round_number, policy)
-        counted = [label for label in weights if label in correct]
-        v = np.array([weights[label] for label in counted])
-        above_zero = sum(weight > 0 for weight in weights.values())
-        is_correct = np.array([correct[label] for label in counted], dtype=bool)
-        rows.append(
-            (
-                policy,
-                len(weights),
-                above_zero,
-                100 * weighted_precision(v, is_correct),
-                100 * weighted_recall(v, is_correct, objects),
-                auroc(v, is_correct) if rank_labels(v) else math.nan,
-            )
-        )
-    return rows
+    return JudgedLabels(correct, objects)
 
 
 def _weights(workspace: Workspace, round_number: int, policy: str) -> dict[tuple[int, int], float]:

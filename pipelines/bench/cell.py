@@ -19,11 +19,11 @@ from pipelines.bench.grid import Job, looks_at_unlabeled
 from pipelines.bench.metered import Metered
 from pipelines.bench.results import JobResult, LabelFigures, Levels, write_result
 from pipelines.bench.settings import Bench
+from pipelines.bench.truth import BENCH_METHODS, TRUTH
 from pipelines.engine.rounds import newest_checkpoint
 from pipelines.engine.runner import Report, open_executor, run_first, run_frames
 from pipelines.engine.schedule import run_all
 from pipelines.round import graph_of, open_plan
-from pipelines.stages.methods import METHODS
 from pipelines.workspace.config_file import write_config
 from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
@@ -63,7 +63,7 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
         recall=found.recall,
         thresholds=found.thresholds,
         difficulties=found.difficulties,
-        labels=_labels(workspace, METHODS[job.method].policy)
+        labels=_labels(workspace, BENCH_METHODS[job.method].policy)
         if job.method is not None and bench.simulated
         else (),
         failed_frames=sum(report.failed for report in reports),
@@ -111,6 +111,11 @@ def _open_cell(bench: Bench, job: Job) -> Workspace:
         _copy_database(source / DATABASE, partial / DATABASE)
         partial.rename(root)
     config = bench.config(job.seed, job.method)
+    if job.method == TRUTH:
+        options = {BENCH_METHODS[TRUTH].policy: {"workspace": str(root)}}
+        config = config.model_copy(
+            update={"solve": config.solve.model_copy(update={"options": options})}
+        )
     for folder in ("exports", "pictures", "reports"):
         (root / folder).mkdir(exist_ok=True)
     write_config(root / CONFIG_NAME, config)

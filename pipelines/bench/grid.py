@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pipelines.assembly import stores_maps
 from pipelines.bench.settings import Axes
+from pipelines.bench.truth import BENCH_METHODS
 from pipelines.engine.stage import CacheStage
 from pipelines.registry import POLICIES
 from pipelines.round import round_graph
-from pipelines.stages.methods import METHODS
 from pipelines.workspace.config import Config
 
 RESULT_FILE = "result.json"
@@ -91,7 +91,9 @@ def waiting(axes: Axes, root: Path) -> list[Job]:
 
 def looks_at_unlabeled(job: Job) -> bool:
     """Return whether the job runs the detector on X_u; later rounds of the baseline do not."""
-    return job.method is None or bool(POLICIES.load(METHODS[job.method].policy).uses_unlabeled)
+    return job.method is None or bool(
+        POLICIES.load(BENCH_METHODS[job.method].policy).uses_unlabeled
+    )
 
 
 def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:

@@ -20,7 +20,7 @@ from pipelines.assessment.evaluation import kitti_objects
 from pipelines.bench.results import OVERLAPS, JobResult, read_results
 from pipelines.bench.settings import SYNTHETIC, Bench
 from pipelines.bench.tables import Entry, Finished, Table, Value, all_tables, signed
-from pipelines.stages.methods import METHODS
+from pipelines.bench.truth import BENCH_METHODS
 from pipelines.workspace.workspace import open_dataset, read_truth
 
 MARKDOWN, NUMBERS = "results.md", "results.json"
@@ -107,8 +107,8 @@ class BenchReport:
             map(str, finished.seeds)
         )
         for name in finished.methods:
-            if name in METHODS:
-                yield f"`{name}`: {METHODS[name].note}"
+            if name in BENCH_METHODS:
+                yield f"`{name}`: {BENCH_METHODS[name].note}"
         yield (
             f"equal optimiser steps: every method trains {settings.rounds} x {settings.steps} "
             "steps from the same teacher, which is trained for "

@@ -12,8 +12,9 @@ from curate.errors import ConfigError, DataError, WorkspaceError
 from curate.files.atomic import replace_file
 from curate.ranges import AtLeastOne
 from curate.spelling import did_you_mean
+from pipelines.bench.truth import BENCH_METHODS, TRUTH
 from pipelines.registry import trainable, trainable_names
-from pipelines.stages.methods import METHODS, with_method
+from pipelines.stages.methods import with_method
 from pipelines.workspace.config import Config, Section, change_setting, make_config
 from pipelines.workspace.config_errors import describe_errors
 
@@ -65,7 +66,7 @@ class Axes(Section):
     """The grid: every method on every draw of labeled frames.
 
     Attributes:
-        methods: names in `METHODS`.
+        methods: names in `BENCH_METHODS`.
         ratios: shares of the training frames that are labeled.
         seeds: seeds of the draw of labeled frames, of training and of the augmented views.
     """
@@ -127,6 +128,8 @@ class Bench:
                 f"--set detector.name={shared.detector.name}: a bench needs a detector that it can "
                 f"train; use one of {', '.join(trainable_names())}"
             )
+        if method == TRUTH and not self.simulated:
+            raise ConfigError(f"--methods {TRUTH}: only simulated data have the truth of X_u")
         return shared if method is None else _under(shared, method, overrides)
 
 
@@ -141,11 +144,11 @@ def check_axes(axes: Axes) -> Axes:
             raise ConfigError(
                 f"--{name} {','.join(map(str, values))}: give one or more values without duplicates"
             )
-    unknown = [name for name in axes.methods if name not in METHODS]
+    unknown = [name for name in axes.methods if name not in BENCH_METHODS]
     if unknown:
-        meant = did_you_mean(unknown[0], METHODS)
+        meant = did_you_mean(unknown[0], BENCH_METHODS)
         raise ConfigError(
-            f"--methods {unknown[0]}: unknown method; choose from {', '.join(METHODS)}{meant}"
+            f"--methods {unknown[0]}: unknown method; choose from {', '.join(BENCH_METHODS)}{meant}"
         )
     for ratio in axes.ratios:
         if not 0 < ratio <= 1:
@@ -208,7 +211,7 @@ def claim(bench: Bench) -> None:
 
 def _under(shared: Config, method: str, overrides: Mapping[str, Any]) -> Config:
     """Return the configuration of a method; it may not change settings of the overrides."""
-    config = with_method(shared, method)
+    config = with_method(shared, BENCH_METHODS[method].policy)
     before, after = shared.model_dump(), config.model_dump()
     for path in _paths(overrides):
         if _at(before, path) != _at(after, path):

@@ -16,7 +16,7 @@ from curate.evaluation.comparison import (
 from curate.evaluation.kitti_rules import DIFFICULTIES
 from pipelines.bench.grid import Job
 from pipelines.bench.results import JobResult, Levels
-from pipelines.stages.methods import METHODS
+from pipelines.bench.truth import BENCH_METHODS
 
 BASELINE = "baseline"
 TEACHER = "teacher"
@@ -83,7 +83,7 @@ class Finished:
         results: the results of all finished jobs.
 
     Attributes:
-        methods: the methods with results, in the order of `METHODS`.
+        methods: the methods with results, in the order of `BENCH_METHODS`.
         ratios: ratios, ascending.
         seeds: seeds, ascending.
     """
@@ -92,7 +92,7 @@ class Finished:
         self._by_job = {result.job: result for result in results}
         cells = [job for job in self._by_job if job.method is not None]
         found = {job.method for job in cells if job.method is not None}
-        known = [name for name in METHODS if name in found]
+        known = [name for name in BENCH_METHODS if name in found]
         self.methods = (*known, *sorted(found - set(known)))
         self.ratios = tuple(sorted({job.ratio for job in cells}))
         self.seeds = tuple(sorted({job.seed for job in cells}))
