@@ -1,6 +1,5 @@
 """Settings and report of a training."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -25,7 +24,7 @@ class TrainingSettings:
             two sums, so pseudo-labels do not replace ground truth.
         learning_rate: peak of the one-cycle schedule; use about half of it for fine-tuning.
         flip_probability: see `Augmentation`.
-        rotation_limit_rad: see `Augmentation`.
+        rotation_limit_rad: see `Augmentation`; a training of thousands of steps can afford more.
         scale_range: see `Augmentation`.
         pasted: see `Augmentation`; 0 disables the object bank.
         fewest_points: see `Augmentation`; applies to the objects of the bank too.
@@ -53,7 +52,7 @@ class TrainingSettings:
     unlabeled_batch_size: Count = 2
     learning_rate: AboveZero = 5e-3
     flip_probability: Share = 0.5
-    rotation_limit_rad: NotNegative = math.pi / 4
+    rotation_limit_rad: NotNegative = 0.2
     scale_range: tuple[AboveZero, AboveZero] = (0.95, 1.05)
     pasted: Count = 4
     fewest_points: Count = 5
