@@ -9,8 +9,9 @@ that is constant except for random accelerations. Each axis of the plane has the
                       P_pv += dt P_vv + q dt^2 / 2,  P_vv += q dt
     update with z     K = P / (P_pp + r),  p += K_p (z - p),  v += K_v (z - p)
 
-Noise is measured in lengths of the object, so that a pedestrian has a smaller gate than a truck
-without a table of categories. The filter runs forward and backward in time. A link between two
+where q and r are the variances of the accelerations and of a box's centre. Noise is measured in
+lengths of the object, so that a pedestrian has a smaller gate than a truck without a table of
+categories. The filter runs forward and backward in time. A link between two
 boxes counts if both runs made it, or if one made it and the other linked neither box elsewhere; so
 the tracks of a reversed sequence are the same.
 """
@@ -26,18 +27,20 @@ from curate.shapes import Float, Int
 
 MAX_GAP_S = 1.0
 """Longest time between two boxes that are linked directly."""
+# 99 % of the boxes of an object are within this squared distance from its prediction, in standard
+# deviations (chi square with 2 degrees of freedom).
 _GATE = 9.21
-# 99 % of the boxes of an object are within this squared distance, in standard deviations (chi
-# square with 2 degrees of freedom).
-_UNSEEN_VELOCITY = 2.5
+# A box of clutter per this area in m2: a link must be more likely than that the box is clutter.
+_CLUTTER_AREA = 2500.0
 # Standard deviation of an object's speed before it is observed, in lengths per second: 10 m/s for a
 # car, 2 m/s for a pedestrian.
+_UNSEEN_SPEED = 2.5
+# Standard deviation of the sensor's own speed where its poses are unknown, in m/s.
 _SENSOR_SPEED = 10.0
-# Standard deviation of the sensor's own speed, in m/s, where its poses are unknown.
+# Standard deviation of the change of speed within a second, in lengths per second.
 _ACCELERATION = 0.75
-# In lengths per second squared, for one second.
-_CENTRE_NOISE = (0.1, 0.05)
 # Standard deviation of a box's centre: metres, and share of its length.
+_CENTRE_NOISE = (0.1, 0.05)
 
 
 @dataclass(frozen=True)
@@ -137,8 +140,8 @@ class _Tracker:
         self._positions, self._lengths = sightings.positions, sightings.lengths
         self._noise = (_CENTRE_NOISE[0] + _CENTRE_NOISE[1] * sightings.lengths) ** 2
         sensor = 0.0 if sightings.fixed else _SENSOR_SPEED
-        self._unseen = (_UNSEEN_VELOCITY * sightings.lengths) ** 2 + sensor**2
-        self._jerk = (_ACCELERATION * sightings.lengths) ** 2
+        self._unseen = (_UNSEEN_SPEED * sightings.lengths) ** 2 + sensor**2
+        self._agitation = (_ACCELERATION * sightings.lengths) ** 2
         self.time = -np.inf
         self.last = np.zeros(0, dtype=np.int64)
         self.seen = np.zeros(0)
@@ -166,30 +169,31 @@ class _Tracker:
         dt, self.time = time - self.time, time
         if not len(self.last):
             return
-        jerk = self._jerk[self.last]
+        agitation = self._agitation[self.last]
         pp, pv, vv = self.covariance
         self.position = self.position + dt * self.velocity
         self.covariance = np.stack(
             [
-                pp + 2 * dt * pv + dt**2 * vv + jerk * dt**3 / 3,
-                pv + dt * vv + jerk * dt**2 / 2,
-                vv + jerk * dt,
+                pp + 2 * dt * pv + dt**2 * vv + agitation * dt**3 / 3,
+                pv + dt * vv + agitation * dt**2 / 2,
+                vv + agitation * dt,
             ]
         )
 
     def _assign(self, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows of matched tracks, and of their boxes among the frame's boxes."""
-        spread = self.covariance[0][:, None] + self._noise[boxes]
+        """Return the rows of matched tracks, and of their boxes among the frame's boxes.
+
+        The total log-likelihood against "each box is clutter" is maximal. For one pair it is,
+        times -2 and with d the distance in standard deviations: d^2 + 2 ln(2 pi variance / area).
+        """
+        variance = self.covariance[0][:, None] + self._noise[boxes]
         offsets = self.position[:, None] - self._positions[boxes]
-        distance = np.einsum("ijk,ijk->ij", offsets, offsets) / spread
-        possible = distance < _GATE
+        distance = np.einsum("ijk,ijk->ij", offsets, offsets) / variance
+        cost = distance + 2 * np.log(2 * np.pi * variance / _CLUTTER_AREA)
+        possible = (distance < _GATE) & (cost < 0)
         rows, columns = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
         near = np.ix_(rows, columns)
-        # The negative log-likelihood, up to constants: of two tracks at the same distance in
-        # standard deviations, the better known one gets the box. Pairs outside the gate cost 0.
-        cost = distance[near] + 2 * np.log(spread[near])
-        cost = np.where(possible[near], cost - 1e3, 0.0)
-        one, other = linear_sum_assignment(cost)
+        one, other = linear_sum_assignment(np.where(possible[near], cost[near], 0.0))
         matched = possible[near][one, other]
         return rows[one[matched]], columns[other[matched]]
 
