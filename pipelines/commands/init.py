@@ -104,9 +104,9 @@ def init(
     from pipelines.assessment.doctor import report_wrong_inputs
     from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
+    from pipelines.labels.sources import check_sequences
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
-    from pipelines.workspace.sequences import check_sequences
     from pipelines.workspace.setup import check_files, initialise
     from pipelines.workspace.workspace import open_dataset
 

@@ -37,13 +37,18 @@ from pipelines.engine.stage import (
     SequenceStage,
     Settings,
 )
-from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
+from pipelines.labels.sources import (
+    Source,
+    check_sequences,
+    prepare_stage,
+    source_of,
+    sources_of,
+)
 from pipelines.registry import PRIORS
 from pipelines.stages.predict import settings_of_results
 from pipelines.stages.reading import FrameReader, ReadsAhead
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
-from pipelines.workspace.sequences import check_sequences
 from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
 
 
