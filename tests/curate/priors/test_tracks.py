@@ -5,10 +5,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from curate.detections import Detections
+from curate.detections import CATEGORIES, Detections
 from curate.errors import ConfigError, DataError
 from curate.priors.base import Evidence, SequenceFrame, check_evidence
 from curate.priors.tracks import Tracks
+from curate.simulation.motion import World
 
 CAR, PEDESTRIAN = (4.0, 1.8, 1.6), (0.8, 0.6, 1.7)
 
@@ -211,3 +212,48 @@ def test_a_description_names_every_figure() -> None:
     row = {name.name: f"<{name.name}>" for name in Tracks.columns}
     text = Tracks().describe(row)
     assert all(value in text for value in row.values())
+
+
+def simulated_labels(seed: int, poses: bool) -> tuple[list[SequenceFrame], np.ndarray]:
+    """Return a simulated drive of 3 s with noisy labels, and the true object of each label.
+
+    One in ten objects is missed in a frame; a third of the labels is clutter of low score (object
+    -1, each at a random place).
+    """
+    rng, times = np.random.default_rng(seed), np.arange(30) / 10
+    world = World.draw(np.random.default_rng([seed, 0]), np.random.default_rng([seed, 3]), times)
+    frames, objects = [], []
+    for number, time in enumerate(times):
+        rows, names = [], []
+        for i, each in enumerate(world.scene(float(time)).placements):
+            if each.kind in CATEGORIES and rng.random() < 0.9:
+                place = each.position[:2] + rng.normal(0, 0.12, size=2)
+                rows.append((*place, 0, *(each.mesh.size * each.scale), each.yaw_rad, 0.7))
+                names.append(each.kind)
+                objects.append(i)
+        for _ in range(len(rows) // 2):
+            kind = rng.choice(CATEGORIES)
+            size = CAR if kind == "Car" else PEDESTRIAN
+            rows.append((*rng.uniform((5, -25), (70, 25)), 0, *size, 0, 0.2))
+            names.append(kind)
+            objects.append(-1)
+        table = np.array(rows).reshape(-1, 8)
+        found = Detections(table[:, :7], table[:, 7], np.array(names, dtype=np.str_))
+        frames.append(frame(number, found, pose=world.pose(float(time)) if poses else None))
+    return frames, np.array(objects)
+
+
+def test_tracks_of_a_simulated_drive_follow_its_objects() -> None:
+    """With poses, tracks are nearly as long as the objects were seen, and clutter stays short."""
+    lengths: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(2):
+        for poses, shares in lengths.items():
+            frames, objects = simulated_labels(seed, poses)
+            length = np.array(column(Tracks().score_sequence(frames), "track_length"))
+            is_object = objects >= 0
+            seen = np.bincount(objects[is_object])[objects[is_object]]
+            shares.append(float(np.mean(length[is_object] / seen)))
+            if poses:
+                assert np.mean(length[~is_object]) < 5
+    assert 0.93 < np.mean(lengths[True]) < 1.07
+    assert abs(np.mean(lengths[True]) - 1) < abs(np.mean(lengths[False]) - 1)
