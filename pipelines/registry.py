@@ -211,6 +211,7 @@ PRIORS = Registry(
         "points": "curate.priors.points:PointPrior",
         "semantic": "curate.priors.semantic:SemanticPrior",
         "density": "curate.priors.density:DensityPrior",
+        "tracks": "curate.priors.tracks:Tracks",
     },
 )
 POLICIES = Registry(

@@ -70,6 +70,12 @@ def kitti_root() -> Path:
 
 
 @pytest.fixture(scope="session")
+def kitti_tracking_root() -> Path:
+    """Return the folder with a real detector's results and the truth of real sequences."""
+    return _shared("CURATE_KITTI_TRACKING", "kitti_tracking")
+
+
+@pytest.fixture(scope="session")
 def kitti_eval_root() -> Path:
     """Return synthetic labels and results, and the AP that the official devkit reports for them."""
     return _shared("CURATE_KITTI_EVAL", "kitti_eval")

@@ -3,8 +3,11 @@
 from collections.abc import Iterable, Mapping
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
 from curate.detections import Annotations
 from curate.frames import Frame, FrameFiles
+from curate.shapes import Float
 
 
 class Dataset(Protocol):
@@ -47,6 +50,27 @@ class Sequenced(Protocol):
 
 
 @runtime_checkable
+class Timed(Protocol):
+    """A data set that can tell when its frames were recorded."""
+
+    def time_of(self, frame_id: str) -> float | None:
+        """Return the time of a frame's sweep in seconds, or None if it is unknown."""
+        ...
+
+
+@runtime_checkable
+class Posed(Protocol):
+    """A data set that can tell where its frames were recorded."""
+
+    def pose_of(self, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+        """Return the pose of the LiDAR in the sequence's map frame, or None if it is unknown.
+
+        It maps LiDAR to map coordinates; z of the map frame is up.
+        """
+        ...
+
+
+@runtime_checkable
 class FileNamed(Protocol):
     """A data set with file names that differ from the names of its frames."""
 
@@ -70,3 +94,13 @@ def sequences_of(dataset: Dataset, frames: Iterable[str]) -> Mapping[str, str]:
         return {}
     found = {frame: dataset.sequence_of(frame) for frame in frames}
     return {frame: sequence for frame, sequence in found.items() if sequence is not None}
+
+
+def time_of(dataset: Dataset, frame_id: str) -> float | None:
+    """Return the time of a frame in seconds, or None if it is unknown."""
+    return dataset.time_of(frame_id) if isinstance(dataset, Timed) else None
+
+
+def pose_of(dataset: Dataset, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+    """Return the pose of the LiDAR in a frame, or None if it is unknown; see `Posed`."""
+    return dataset.pose_of(frame_id) if isinstance(dataset, Posed) else None

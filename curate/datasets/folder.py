@@ -8,6 +8,8 @@ images = "camera"             # folder of FRAME.png or .jpg; if there are no ima
 labels = "label_2"            # optional: folder of KITTI label files of the labeled frames
 splits = "lists"              # optional: folder of train.txt, val.txt
 sequence_separator = "_"      # optional: frames are named SEQUENCE_NUMBER; the last one separates
+poses = "poses"               # optional: folder of FRAME.txt, 3 x 4 or 4 x 4 numbers, LiDAR to map
+times = "times.txt"           # optional: a file with lines "FRAME SECONDS"
 columns = 4                   # number of columns of .bin and .npy files
 column_names = ["x", "y", "z", "intensity", "ring"]   # optional: their names, in any order
 intensity_field = "intensity" # optional: the column of the intensity, where several may be it
@@ -46,6 +48,7 @@ from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import read_calibration
 from curate.datasets.kitti.dataset import checked_frames, read_frame_lists
 from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.motion import read_pose, read_times
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
 from curate.errors import ConfigError, DataError
@@ -61,10 +64,11 @@ from curate.frames import (
     calibration_without_camera,
 )
 from curate.geometry.mounting import check_lidar_to_camera, check_rotation_y
+from curate.shapes import Float
 from curate.spelling import did_you_mean
 
 DESCRIPTION = "dataset.toml"
-_FOLDERS = ("points", "images", "labels", "splits")
+_FOLDERS = ("points", "images", "labels", "splits", "poses", "times")
 _TEXTS = (*_FOLDERS, "sequence_separator")
 _OF_CAMERA = ("images", "image_size", "calibration")
 # The keys that describe the point files; the settings in [dataset] have the same names.
@@ -206,6 +210,36 @@ class FolderDataset:
         if not separator or separator not in frame_id:
             return None
         return frame_id.rpartition(separator)[0]
+
+    def time_of(self, frame_id: str) -> float | None:
+        """Return the time of a frame in the file `times`, or None if the key is not set.
+
+        Raises:
+            DataError: if the file is missing or malformed, or does not contain the frame.
+        """
+        if "times" not in self._description:
+            return None
+        if frame_id not in self._times:
+            path = self.root / self._description["times"]
+            raise DataError(f"{path}: no line for frame {frame_id}")
+        return self._times[frame_id]
+
+    @cached_property
+    def _times(self) -> Mapping[str, float]:
+        return read_times(self.root / self._description["times"])
+
+    def pose_of(self, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+        """Return the pose of the LiDAR in the folder `poses`, or None if the key is not set.
+
+        Raises:
+            DataError: if the frame's file is missing, or not a pose.
+        """
+        if "poses" not in self._description:
+            return None
+        check_frame_id(frame_id)
+        path = self.root / self._description["poses"] / f"{frame_id}.txt"
+        self._boundary.check(path)
+        return read_pose(path)
 
     def read(self, frame_id: str, *, points: bool = True, image: bool = False) -> Frame:
         """Read the frame's calibration and image size, and its points and image if requested.

@@ -97,12 +97,17 @@ def rotation_y_of_tools(calibration: Calibration) -> RotationY:
     return "openpcdet" if ahead else "calibration"
 
 
-def check_lidar_to_camera(matrix: Float[np.ndarray, "4 4"], place: str) -> None:
-    """Check that a transform between LiDAR and camera is a rotation and a translation.
+def check_lidar_to_camera(
+    matrix: Float[np.ndarray, "4 4"],
+    place: str,
+    name: str = "the transform from LiDAR to camera",
+) -> None:
+    """Check that a transform, such as that between LiDAR and camera, is a rotation and a shift.
 
     Args:
         matrix: the transform.
         place: the file, for messages.
+        name: what it is, for messages.
 
     Raises:
         DataError: if it scales, shears or mirrors.
@@ -111,13 +116,13 @@ def check_lidar_to_camera(matrix: Float[np.ndarray, "4 4"], place: str) -> None:
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _LARGEST_ERROR:
         lengths = ", ".join(f"{length:.3g}" for length in np.linalg.norm(rotation, axis=1))
         raise DataError(
-            f"{place}: the transform from LiDAR to camera is not a rotation (its rows must be "
+            f"{place}: {name} is not a rotation (its rows must be "
             f"orthogonal and of length 1, their lengths are {lengths}); correct the calibration"
         )
     if np.linalg.det(rotation) < 0:
         raise DataError(
-            f"{place}: the transform from LiDAR to camera mirrors (its determinant is -1); one "
-            "axis has the wrong sign, correct the calibration"
+            f"{place}: {name} mirrors (its determinant is -1); one axis has the wrong sign, "
+            "correct the calibration"
         )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from curate.detections import Detections
 from curate.errors import ConfigError, DataError
 from curate.frames import Frame
+from curate.shapes import Float
 
 KINDS = ("int32", "int64", "float64", "name")
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -106,15 +107,22 @@ class SequenceFrame:
         frame_id: id of the frame.
         detections: the labels of the frame, in the order of k.
         read: reads the frame with its points; for sources that need more than the labels.
+        time_s: time of the sweep in seconds; None if the data set has no timestamps.
+        pose: (4, 4) pose of the LiDAR in a map frame; None if the data set has no poses.
     """
 
     frame_id: str
     detections: Detections
     read: Callable[[], Frame]
+    time_s: float | None = None
+    pose: Float[np.ndarray, "4 4"] | None = None
 
 
 class SequenceSource(EvidenceDeclaration, Protocol):
     """Evidence from all frames of a sequence, such as tracks. Sources inherit from this class."""
+
+    def check_frame(self, frame_id: str, time_s: float | None) -> None:
+        """Raise DataError if a frame of a sequence cannot be used; called before any work."""
 
     def score_sequence(self, frames: Sequence[SequenceFrame]) -> Sequence[Evidence]:
         """Return the evidence of each frame's labels, in the order of the frames."""

@@ -124,10 +124,13 @@ def render(scene: Scene, caster: Caster, rig: CameraRig, generator: np.random.Ge
 
 def _markings(street: Street, light: Light) -> Markings:
     """Return the road markings of a street, interrupted where another street crosses."""
-    lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1)
+    s, d, _ = street.origin
+    lines = street.axis_d + street.lane_m * np.arange(-street.lanes, street.lanes + 1) - d
     half = street.crossing_half_m + 1.5
     crossing = (
-        np.zeros(2) if street.crossing_s is None else street.crossing_s + np.array([-half, half])
+        np.zeros(2)
+        if street.crossing_s is None
+        else street.crossing_s - s + np.array([-half, half])
     )
     paint = _LINE_PAINT * (light.ambient + 0.6 * light.direct)
     return Markings(

@@ -224,7 +224,7 @@ class Population:
         extent = mesh.size[:2] * scale[:2]
         if not _in_view(position, float(extent.max())):
             return
-        discs = _footprint(position, yaw_rad, extent, margin)
+        discs = footprint(position, yaw_rad, extent, margin)
         if apart and self._overlaps(discs):
             return
         if apart and kind != "tree":
@@ -271,7 +271,7 @@ def _in_view(position: np.ndarray, extent: float) -> bool:
     return bool(abs(np.arctan2(position[1], position[0])) < _HALF_VIEW_RAD + margin)
 
 
-def _footprint(
+def footprint(
     position: np.ndarray, yaw_rad: float, extent: np.ndarray, margin: float
 ) -> np.ndarray:
     """Return (n, 3) discs x, y, radius along the longer side of a rectangle (length, width).

@@ -1,12 +1,13 @@
 """The ground of one scene: a street with lanes, kerbs and pavements, and its height profile.
 
 Road coordinates are s along the street and d to its left, in metres. The sensors are at s = d = 0,
-1.73 m above the road. The street's heading is within a few degrees of the LiDAR's x axis.
+1.73 m above the road, until the vehicle moves. The street's heading is within a few degrees of the
+LiDAR's x axis.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -33,6 +34,7 @@ class Street:
         crossing_half_m: half the width of the crossing street.
         slope: rise per metre along s and along d.
         wave: amplitude in metres, wavelength in metres and phase of the height profile.
+        origin: s and d of the sensors, and their rise in metres, since they were at s = d = 0.
     """
 
     heading_rad: float
@@ -46,6 +48,7 @@ class Street:
     crossing_half_m: float
     slope: tuple[float, float]
     wave: tuple[float, float, float]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def draw(cls, generator: np.random.Generator) -> Self:
@@ -92,10 +95,15 @@ class Street:
 
     def to_lidar(self, s: float, d: float) -> np.ndarray:
         """Return the (3,) x, y, z of a point on the ground in the LiDAR frame."""
-        cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
         kerb = 0.0 if self.right_d < d < self.left_d else self._kerb_m
         height = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d + kerb
-        return np.array([cos * s - sin * d, sin * s + cos * d, height])
+        return np.array([*self._from_sensors(s, d), height - self.origin[2]])
+
+    def _from_sensors(self, s: Any, d: Any) -> tuple[Any, Any]:
+        """Return x and y in the LiDAR frame of points in road coordinates."""
+        cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        s, d = s - self.origin[0], d - self.origin[1]
+        return cos * s - sin * d, sin * s + cos * d
 
     def ground(self) -> Mesh:
         """Return the mesh of the ground: asphalt, pavements and yards."""
@@ -103,8 +111,7 @@ class Street:
         outside = (d < self.right_d - 1e-6) | (d > self.left_d + 1e-6)
         z = np.interp(s, self._knots_s, self._profile) + self.slope[1] * d
         z += outside * self._kerb_m
-        cos, sin = np.cos(self.heading_rad), np.sin(self.heading_rad)
-        vertices = np.stack([cos * s - sin * d, sin * s + cos * d, z], axis=-1)
+        vertices = np.stack([*self._from_sensors(s, d), z - self.origin[2]], axis=-1)
         rows, columns = s.shape
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         first = np.stack([corner, corner + columns, corner + columns + 1], axis=1)

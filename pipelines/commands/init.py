@@ -104,6 +104,7 @@ def init(
     from pipelines.assessment.doctor import report_wrong_inputs
     from pipelines.assessment.missing_results import report_missing_results
     from pipelines.category_names import check_before_init, stored_names
+    from pipelines.labels.sources import check_sequences
     from pipelines.workspace.config import change_setting, make_config
     from pipelines.workspace.images import fit_priors, report_images
     from pipelines.workspace.setup import check_files, initialise
@@ -145,6 +146,7 @@ def init(
     if config.train.command is not None:
         check_labels_format(config, frames)
     config = fit_priors(config, frames, explicit=chosen)
+    check_sequences(config, frames)
     workspace = initialise(directory, config, labeled, val)
     report_missing_results(workspace, supplied)
     report_wrong_inputs(workspace)

@@ -5,14 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
-from curate.errors import ConfigError
+from curate.datasets.base import Dataset, sequences_of, time_of
+from curate.errors import ConfigError, error_prefix
 from curate.exporters.columns import WEIGHTED_LABELS
 from curate.priors.base import Column, check_declaration
 from curate.priors.semantic import SemanticPrior
 from db import bulk
 from db.evidence import OWN_TABLES, Declaration, declare, read_declarations
 from db.views import create_views, drop_views
+from pipelines.assembly import open_sequence_source
 from pipelines.registry import PRIORS
+from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 _log = logging.getLogger(__name__)
@@ -99,6 +102,29 @@ def sources_of(names: Sequence[str]) -> tuple[Source, ...]:
                         f"{column.name}; use one of them"
                     )
     return found
+
+
+def check_sequences(config: Config, dataset: Dataset) -> None:
+    """Check that the data set has what the sources of `run.priors` for whole sequences need.
+
+    Raises:
+        ConfigError: if no frame belongs to a known sequence.
+        DataError: if a source cannot use a frame, for example because its time is unknown.
+    """
+    for name in config.run.priors:
+        if not source_of(name).of_sequences:
+            continue
+        sequences = sequences_of(dataset, dataset.frame_ids())
+        if not sequences:
+            raise ConfigError(
+                f"run.priors: '{name}' needs sequences, but the data set {config.dataset.root} "
+                f"(kind {config.dataset.kind}) has none: use a kind with sequences (see "
+                f"docs/datasets.md), or leave '{name}' out of run.priors"
+            )
+        source = open_sequence_source(config, name)
+        with error_prefix("run.priors"):
+            for frame in sequences:
+                source.check_frame(frame, time_of(dataset, frame))
 
 
 def prepare_stage(workspace: Workspace, source: Source) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import select
 
-from curate.errors import WorkspaceError
+from curate.datasets.base import pose_of, time_of
+from curate.errors import DataError, WorkspaceError
 from curate.frames import Frame
 from curate.priors.base import Evidence, Measured, SequenceFrame, check_evidence
 from curate.priors.points import learn_thresholds
@@ -36,7 +37,13 @@ from pipelines.engine.stage import (
     SequenceStage,
     Settings,
 )
-from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
+from pipelines.labels.sources import (
+    Source,
+    check_sequences,
+    prepare_stage,
+    source_of,
+    sources_of,
+)
 from pipelines.registry import PRIORS
 from pipelines.stages.predict import settings_of_results
 from pipelines.stages.reading import FrameReader, ReadsAhead
@@ -130,8 +137,15 @@ class ScoreSequence:
         for each in job.frames:
             if each.predictions is None:
                 raise WorkspaceError(f"frame {each.frame}: the job has no predictions")
-            read = partial(self.dataset.read, each.frame)
-            frames.append(SequenceFrame(each.frame, each.predictions, read))
+            frames.append(
+                SequenceFrame(
+                    each.frame,
+                    each.predictions,
+                    partial(self.dataset.read, each.frame),
+                    time_of(self.dataset, each.frame),
+                    pose_of(self.dataset, each.frame),
+                )
+            )
         found = self.opened.score_sequence(frames)
         table = source_of(self.source).table
         return [
@@ -161,6 +175,7 @@ def stage(source: Source, maps: Sequence[str] = ()) -> FramesStage:
             writes=(source.table,),
             settings=partial(_sequence_settings, source),
             function=lambda workspace, _context: ScoreSequence(workspace.config, name),
+            check=partial(_check, name),
             prepare=partial(prepare_stage, source=source),
         )
     learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
@@ -205,6 +220,7 @@ def _check(name: str, workspace: Workspace) -> None:
     if PRIORS.takes(name, "segmenter"):
         check_segmentable(workspace.config, workspace.dataset)
     check_prior(workspace.config, name)
+    check_sequences(workspace.config, workspace.dataset)
 
 
 def _declared(source: Source) -> Settings:
@@ -228,7 +244,20 @@ def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> S
 def _sequence_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
     """Return what the evidence of a sequence depends on besides its predictions."""
     options = workspace.config.run.prior_options.get(source.configured, {})
-    return {"options": options, **_declared(source)}
+    return {"options": options, "known": _known_motion(workspace), **_declared(source)}
+
+
+def _known_motion(workspace: Workspace) -> Settings:
+    """Return whether the data set has times and poses, as its first frame shows."""
+    dataset = workspace.dataset
+    first = next(iter(dataset.frame_ids()), None)
+    try:
+        return {
+            "times": first is not None and time_of(dataset, first) is not None,
+            "poses": first is not None and pose_of(dataset, first) is not None,
+        }
+    except DataError:  # reported when the sequence is processed
+        return {}
 
 
 def _measured_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:

@@ -12,6 +12,7 @@ from support.dataset_layouts import write_toy_folder, write_toy_raw, write_toy_t
 from support.nuscenes_scenes import write_nuscenes
 from support.toys import write_toy_kitti
 
+from curate.datasets.base import pose_of, time_of
 from curate.datasets.formats.point_layout import PointLayout
 from curate.errors import DataError
 from curate.frames import Frame
@@ -117,6 +118,16 @@ def test_annotations_are_boxes_in_the_lidar_frame(dataset) -> None:
         assert (np.abs(truth.boxes[has_box, 6]) <= np.pi).all()
         assert set(truth.categories[~has_box]) <= {"DontCare"}
         assert_same(truth, dataset.annotations(name))
+
+
+def test_times_and_poses_have_the_documented_types(dataset) -> None:
+    """A time is a number of seconds, a pose a rigid (4, 4) transform; either may be unknown."""
+    for name in dataset.frame_ids():
+        time, pose = time_of(dataset, name), pose_of(dataset, name)
+        assert time is None or isinstance(time, float)
+        if pose is not None:
+            np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)
+            assert pose[3].tolist() == [0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("part", ["points", "image", "calibration", "label"])

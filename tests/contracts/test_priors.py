@@ -1,4 +1,4 @@
-"""The contract of every registered prior."""
+"""The contract of every registered evidence source: of those of a frame, then of a sequence."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +10,7 @@ from support.toys import SIZES, ToySegmenter
 
 from curate.detections import CATEGORIES, Detections
 from curate.errors import ConfigError
-from curate.priors.base import Evidence, check_evidence
+from curate.priors.base import Evidence, SequenceFrame, check_evidence
 from db.evidence import evidence_table
 from db.models import Base
 from pipelines.labels.sources import source_of
@@ -34,9 +34,13 @@ def build(name: str, *, measures: bool = True):
         pytest.fail(f"{error}; where options are missing, add them to SAMPLES here")
 
 
-@pytest.fixture(params=sorted(PRIORS.classes))
+OF_SEQUENCES = [name for name in sorted(PRIORS.classes) if source_of(name).of_sequences]
+OF_FRAMES = [name for name in sorted(PRIORS.classes) if name not in OF_SEQUENCES]
+
+
+@pytest.fixture(params=OF_FRAMES)
 def prior(request: pytest.FixtureRequest):
-    """Return every registered prior in turn."""
+    """Return every registered source of frames in turn."""
     return build(request.param)
 
 
@@ -74,9 +78,10 @@ def test_evidence_has_the_declared_columns(prior, frames, count: int) -> None:
     assert list(check_evidence(prior, found, count)) == list(found)
 
 
-def test_a_declaration_matches_its_table(request: pytest.FixtureRequest, prior) -> None:
+@pytest.mark.parametrize("name", sorted(PRIORS.classes))
+def test_a_declaration_matches_its_table(name: str) -> None:
     """The columns are in order, each with a unit or none, and a meaning."""
-    name = request.node.callspec.params["prior"]
+    prior = build(name)
     declaration = source_of(name).declaration
     is_builtin = declaration.table in Base.metadata.tables
     table = Base.metadata.tables[declaration.table] if is_builtin else evidence_table(declaration)
@@ -164,3 +169,56 @@ def test_the_image_is_read_only_if_it_is_needed(prior, frames) -> None:
         assert_same_evidence(
             prior.score(bare, random_labels(9)), prior.score(frames[0], random_labels(9))
         )
+
+
+@pytest.fixture(params=OF_SEQUENCES)
+def sequence_source(request: pytest.FixtureRequest):
+    """Return every registered source of sequences in turn."""
+    return build(request.param)
+
+
+def sequence(frames, counts=(30, 0, 20, 1), seed: int = 0) -> list[SequenceFrame]:
+    """Return a sequence of frames with random labels."""
+    return [
+        SequenceFrame(
+            f"0001_{i:06d}", random_labels(count, seed + i), lambda: frames[0], i / 10, np.eye(4)
+        )
+        for i, count in enumerate(counts)
+    ]
+
+
+def test_evidence_of_a_sequence_has_the_declared_columns(sequence_source, frames) -> None:
+    """One value per label and column of each frame, in the declared order and type."""
+    for counts in [(), (0,), (1,), (30, 0, 20, 1)]:
+        found = sequence_source.score_sequence(sequence(frames, counts))
+        assert len(found) == len(counts)
+        for evidence, count in zip(found, counts, strict=True):
+            stored = check_evidence(sequence_source, evidence, count)
+            assert list(stored) == [column.name for column in sequence_source.columns]
+
+
+def test_evidence_of_a_sequence_does_not_depend_on_orders(sequence_source, frames) -> None:
+    """Of the labels within a frame, of the frames, and of earlier calls."""
+    whole = sequence(frames)
+    expected = sequence_source.score_sequence(whole)
+    order = np.random.default_rng(2).permutation(30)
+    first = replace(whole[0], detections=whole[0].detections.select(order))
+    shuffled = sequence_source.score_sequence([*whole[:0:-1], first])
+    for i, evidence in enumerate(reversed(shuffled)):
+        for name, column in evidence.items():
+            wanted = expected[i][name][order] if i == 0 else expected[i][name]
+            np.testing.assert_allclose(column, wanted, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_labels_of_a_sequence_are_not_modified(sequence_source, frames) -> None:
+    whole = sequence(frames)
+    for each in whole:
+        for array in (each.detections.boxes, each.detections.scores, each.pose):
+            array.flags.writeable = False
+    sequence_source.score_sequence(whole)
+
+
+def test_a_source_of_sequences_is_explained_in_one_line(sequence_source) -> None:
+    line = sequence_source.describe({column.name: "1" for column in sequence_source.columns})
+    assert line
+    assert "\n" not in line

@@ -21,6 +21,9 @@ from curate.datasets.kitti.calibration import (
 )
 from curate.datasets.kitti.dataset import KittiDataset, read_drives
 from curate.datasets.kitti.labels import read_objects
+from curate.datasets.kitti.oxts import read_oxts
+from curate.datasets.kitti.oxts import read_times as read_timestamps
+from curate.datasets.motion import read_pose, read_times
 from curate.datasets.nuscenes.tables import read_table
 from curate.detectors.recorded import RecordedDetector
 from curate.errors import CurateError
@@ -214,6 +217,16 @@ READERS: Mapping[str, Reader] = {
         "2011_09_26 drive_5 0000000109\n2011_09_26 drive_9 0000000130\n",
         lambda folder: (folder / "train_rand.txt").write_text("2,1") and None,
     ),
+    "oxts": Reader(
+        "0000.txt",
+        lambda path: read_oxts(path).tolist(),
+        "49.0 8.4 110 0 0 1.5 0 0\n49.1 8.4 110 0 0 1.5\n",
+    ),
+    "timestamps": Reader(
+        "timestamps.txt", read_timestamps, "2011-09-26 13:02:25.59\n2011-09-26 13:02:25.69\n"
+    ),
+    "times": Reader("times.txt", read_times, "a_0 0.5\na_1 1e2\n"),
+    "pose": Reader("a_0.txt", lambda path: read_pose(path).tolist(), "1 0 0 5\n0 1 0 6\n0 0 1 7\n"),
     "frame list": Reader(
         "a.txt", lambda path: match_frame_list(path, ("000001", "000002")), "000001\n2\n"
     ),

@@ -27,8 +27,11 @@ from curate.datasets.kitti.calibration import (
 )
 from curate.datasets.kitti.dataset import read_drives, read_points
 from curate.datasets.kitti.labels import parse_rows, read_objects, to_annotations, to_detections
+from curate.datasets.kitti.oxts import read_lidar_to_imu, read_oxts
+from curate.datasets.kitti.oxts import read_times as read_timestamps
 from curate.datasets.kitti.tracking import rows_by_frame
 from curate.datasets.kitti.tracklets import TrackletTable
+from curate.datasets.motion import read_pose, read_times
 from curate.detectors.recorded.formats import read_results
 from curate.detectors.recorded.results import ReadOptions
 from curate.detectors.recorded.table import TableRecord
@@ -359,6 +362,19 @@ TARGETS: dict[str, Target] = {
     "raw calibration": Target(
         "calib_velo_to_cam.txt", _raw_calibration, lambda path: read_raw_calibration(path.parent)
     ),
+    "imu calibration": Target(
+        "calib_imu_to_velo.txt", _bytes(b"R: 1 0 0 0 1 0 0 0 1\nT: -1 0 0.5\n"), read_lidar_to_imu
+    ),
+    "oxts": Target(
+        "0000.txt", _bytes(b"49.0 8.4 110 0 0 1.5 0 0\n49.1 8.4 110 0 0 1.5\n"), read_oxts
+    ),
+    "timestamps": Target(
+        "timestamps.txt",
+        _bytes(b"2011-09-26 13:02:25.59\n2011-09-26 13:02:25.69\n"),
+        read_timestamps,
+    ),
+    "times": Target("times.txt", _bytes(b"a_0 0.5\na_1 1e2\n"), read_times),
+    "pose": Target("a_0.txt", _bytes(b"1 0 0 5\n0 1 0 6\n0 0 1 7\n"), read_pose),
     "drives": Target("train_rand.txt", _drives, lambda path: read_drives(path.parent)),
     "frame list": Target("train.txt", _bytes(b"000000\n000001\n"), read_frame_list),
     "labels": Target("000000.txt", _bytes(LABELS), _read_labels),

@@ -46,6 +46,7 @@ _WAYMO_NAME = re.compile(r"\d{7}")
 # The folder of KITTI's development kit that says which drive each frame of training/ is from.
 _MAPPINGS = ("mapping", "devkit_object/mapping", "devkit/mapping")
 _MAPPING_FILES = ("train_mapping.txt", "train_rand.txt")
+_TURNS_PER_SECOND = 10  # of KITTI's LiDAR; each turn is a frame
 
 
 class KittiDataset:
@@ -176,10 +177,19 @@ class KittiDataset:
         """
         if self._front and _WAYMO_NAME.fullmatch(frame_id):
             return frame_id[:4]
-        return self._drives.get(frame_id)
+        return self._drives[frame_id][0] if frame_id in self._drives else None
+
+    def time_of(self, frame_id: str) -> float | None:
+        """Return the time of a frame since its drive began, if the drive is known.
+
+        Raises:
+            DataError: if `sequence_of` raises it.
+        """
+        found = self._drives.get(frame_id)
+        return None if found is None else found[1] / _TURNS_PER_SECOND
 
     @cached_property
-    def _drives(self) -> Mapping[str, str]:
+    def _drives(self) -> Mapping[str, tuple[str, int]]:
         homes = (self.root / folder for folder in _MAPPINGS)
         home = next((home for home in homes if (home / _MAPPING_FILES[0]).is_file()), None)
         if home is None:
@@ -292,8 +302,8 @@ def _camera(home: Path, camera: int | None, *, front: bool) -> int:
     return camera
 
 
-def read_drives(folder: Path) -> Mapping[str, str]:
-    """Return the drive of each frame of KITTI's training/.
+def read_drives(folder: Path) -> Mapping[str, tuple[str, int]]:
+    """Return the drive of each frame of KITTI's training/, and its number in the drive.
 
     train_mapping.txt has a line "date drive frame" for each recorded frame. train_rand.txt has one
     number for each frame of training/: the number of its line in train_mapping.txt, from 1. For
@@ -304,7 +314,10 @@ def read_drives(folder: Path) -> Mapping[str, str]:
     """
     mapping, path = (folder / name for name in _MAPPING_FILES)
     lines = map(str.split, read_lines(mapping, "mapping"))
-    drives = [line[1] for line in lines if len(line) == 3]
+    rows = [(line[1], line[2]) for line in lines if len(line) == 3]
+    if wrong := [number for _, number in rows if not (number.isascii() and number.isdecimal())]:
+        raise DataError(f"{mapping}: {wrong[0][:40]!r} is not the number of a frame")
+    drives = [(drive, int(number)) for drive, number in rows]
     text = read_text(path, "mapping")
     try:
         numbers = [int(number) for number in text.replace(",", " ").split()]

@@ -15,7 +15,7 @@ import numpy as np
 
 from curate.datasets.formats.clouds import CLOUD_SUFFIXES
 from curate.datasets.formats.containment import Boundary
-from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder
+from curate.datasets.formats.frame_files import IMAGE_SUFFIXES, FrameFolder, visible_names
 from curate.datasets.formats.images import read_optional_image
 from curate.datasets.formats.point_layout import UNDECLARED, PointLayout
 from curate.datasets.kitti.calibration import RAW_CAMERAS, RAW_TO_CAMERA, read_raw_calibration
@@ -27,6 +27,7 @@ from curate.datasets.kitti.dataset import (
     read_points,
 )
 from curate.datasets.kitti.labels import read_annotations
+from curate.datasets.kitti.oxts import imu_pose, read_lidar_to_imu, read_oxts, read_times
 from curate.datasets.kitti.sequences import SequenceFrames
 from curate.datasets.kitti.tracklets import TRACKLETS, TrackletTable
 from curate.datasets.recognition import layout_hint
@@ -35,8 +36,11 @@ from curate.errors import DataError
 from curate.files.paths import StrPath
 from curate.frames import Calibration, Frame, FrameFiles, RotationY
 from curate.geometry.mounting import check_rotation_y
+from curate.shapes import Float
 
 _POINTS, _IMAGES = Path("velodyne_points/data"), Path("image_02/data")
+_TIMES, _OXTS = Path("velodyne_points/timestamps.txt"), Path("oxts/data")
+_TO_LIDAR = "calib_imu_to_velo.txt"
 # The root is a date folder with drives, or a folder of date folders.
 _DRIVES = ("*", "*/*")
 
@@ -51,6 +55,36 @@ class _Drive:
         labels, tracklets = folder / "label_2", folder / TRACKLETS
         self.has_tracklets = tracklets.is_file() and not labels.is_dir()
         self.labels = tracklets if self.has_tracklets else labels
+
+    @cached_property
+    def times(self) -> Sequence[float]:
+        """The time of each frame by its number; empty if there are no timestamps."""
+        path = self.folder / _TIMES
+        return read_times(path) if path.exists() else []
+
+    @cached_property
+    def first_latitude(self) -> float | None:
+        """The latitude of the first frame with a position; None if there are no positions."""
+        first = min(visible_names(self.folder / _OXTS), default=None)
+        return None if first is None else float(self._position(first)[0])
+
+    def _position(self, name: str) -> np.ndarray:
+        path = self.folder / _OXTS / name
+        rows = read_oxts(path)
+        if len(rows) != 1:
+            raise DataError(f"{path}: {len(rows)} lines, expected one")
+        return np.asarray(rows[0])
+
+    @cached_property
+    def _lidar_to_imu(self) -> np.ndarray:
+        return read_lidar_to_imu(self.folder.parent / _TO_LIDAR)
+
+    def pose(self, number: str) -> np.ndarray | None:
+        """Return the pose of the LiDAR in a frame; None if the drive has no positions."""
+        latitude = self.first_latitude
+        if latitude is None:
+            return None
+        return np.asarray(imu_pose(self._position(f"{number}.txt"), latitude) @ self._lidar_to_imu)
 
     def label(self, number: str) -> Path:
         """Return the path of the file with a frame's labels, which need not exist."""
@@ -129,6 +163,29 @@ class KittiRawDataset:
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the drive of a frame, or None if there is no such frame."""
         return self._frame(frame_id)[0].folder.name if frame_id in self._frames else None
+
+    def time_of(self, frame_id: str) -> float | None:
+        """Return the time of a frame's sweep, or None if its drive has no timestamps.
+
+        Raises:
+            DataError: if the timestamps are malformed, or too few.
+        """
+        drive, number = self._frame(frame_id)
+        self._boundary.check(drive.folder / _TIMES)
+        index = frame_number(number, drive.points.path(number))
+        if drive.times and index >= len(drive.times):
+            raise DataError(f"{drive.folder / _TIMES}: no line for frame {index}")
+        return drive.times[index] if drive.times else None
+
+    def pose_of(self, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+        """Return the pose of the LiDAR, x east, y north; None if the drive has no oxts/data.
+
+        Raises:
+            DataError: if the frame's file or calib_imu_to_velo.txt is missing or malformed.
+        """
+        drive, number = self._frame(frame_id)
+        self._boundary.check(drive.folder / _OXTS, drive.folder.parent / _TO_LIDAR)
+        return drive.pose(number)
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; all frames of a date share the calibration.

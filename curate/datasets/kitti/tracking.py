@@ -2,8 +2,8 @@
 
 Source: Geiger et al., "Are we ready for autonomous driving?", CVPR 2012, and the readme of its
 tracking development kit. ROOT/training or ROOT contains velodyne/0000/000000.bin,
-image_02/0000/000000.png, calib/0000.txt and label_02/0000.txt, where 0000 is the sequence. A frame
-id is the sequence and the number: 0000_000000.
+image_02/0000/000000.png, calib/0000.txt, label_02/0000.txt and optionally oxts/0000.txt (the poses
+of the vehicle), where 0000 is the sequence. A frame id is the sequence and the number: 0000_000000.
 
 A line of a label file is the number of the frame, the number of the track (-1 for DontCare), and
 then the 15 fields of the object data set; result files have an 18th field, the score, which is left
@@ -32,6 +32,7 @@ from curate.datasets.kitti.dataset import (
     read_points,
 )
 from curate.datasets.kitti.labels import LABEL_FIELDS, parse_rows, read_rows, to_annotations
+from curate.datasets.kitti.oxts import imu_pose, read_lidar_to_imu, read_oxts
 from curate.datasets.kitti.sequences import SequenceFrames
 from curate.datasets.recognition import layout_hint
 from curate.detections import Annotations
@@ -39,6 +40,7 @@ from curate.errors import DataError, error_prefix
 from curate.files.paths import StrPath
 from curate.frames import Frame, FrameFiles, RotationY
 from curate.geometry.mounting import check_rotation_y
+from curate.shapes import Float
 
 # The fraction outside the image for a level of truncation.
 _TRUNCATION = {0: 0.0, 1: 0.5, 2: 1.0}
@@ -55,6 +57,17 @@ class _Sequence:
         self.images = FrameFolder(home / "image_02" / name, IMAGE_SUFFIXES, "image")
         self.calibration = home / "calib" / f"{name}.txt"
         self.label = home / "label_02" / f"{name}.txt"
+        self.oxts = home / "oxts" / f"{name}.txt"
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """The rows of the OXTS file by the number of the frame; empty if there is none."""
+        return read_oxts(self.oxts) if self.oxts.exists() else np.zeros((0, 6))
+
+    @cached_property
+    def lidar_to_imu(self) -> np.ndarray:
+        """The (4, 4) transform from the LiDAR to the IMU."""
+        return read_lidar_to_imu(self.calibration)
 
 
 class KittiTrackingDataset:
@@ -133,6 +146,22 @@ class KittiTrackingDataset:
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the sequence of a frame, or None if there is no such frame."""
         return self._frame(frame_id)[0].name if frame_id in self._frames else None
+
+    def pose_of(self, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+        """Return the pose of the LiDAR, x east, y north; None if the sequence has no OXTS file.
+
+        Raises:
+            DataError: if the file is malformed or has no line for the frame, or the calibration
+                has no transform from the IMU to the LiDAR.
+        """
+        sequence, number = self._frame(frame_id)
+        self._boundary.check(sequence.oxts, sequence.calibration)
+        rows, index = sequence.positions, frame_number(number, sequence.points.path(number))
+        if not len(rows):
+            return None
+        if index >= len(rows):
+            raise DataError(f"{sequence.oxts}: no line for frame {index}")
+        return np.asarray(imu_pose(rows[index], float(rows[0, 0])) @ sequence.lidar_to_imu)
 
     def files(self, frame_id: str) -> FrameFiles:
         """Return the paths of the frame's files; a sequence shares calibration and label file.

@@ -35,6 +35,7 @@ from curate.files.paths import StrPath
 from curate.frames import Camera, Frame, FrameFiles
 from curate.geometry.similarity import Similarity
 from curate.ranges import Count
+from curate.shapes import Float
 
 _COLUMNS, _FULL_INTENSITY = 5, 255.0
 
@@ -155,6 +156,14 @@ class NuScenesDataset:
     def sequence_of(self, frame_id: str) -> str | None:
         """Return the scene of a frame, 20 seconds of a drive, or None for an unknown frame."""
         return self._keyframes[frame_id].scene if frame_id in self._keyframes else None
+
+    def time_of(self, frame_id: str) -> float | None:
+        """Return the time of the sample in seconds."""
+        return self._frame(frame_id).time_s
+
+    def pose_of(self, frame_id: str) -> Float[np.ndarray, "4 4"] | None:
+        """Return the pose of the LiDAR in the map."""
+        return self._frame(frame_id).cameras[0].calibration.pose_in_map()
 
     def file_names(self) -> Mapping[str, str]:
         """Return the sample token of each name of a sweep or image without suffix."""

@@ -23,6 +23,7 @@ from curate.datasets.formats.images import MAX_PIXELS
 from curate.datasets.nuscenes.tables import (
     Record,
     count,
+    microseconds,
     numbers,
     parse_record,
     pose,
@@ -48,6 +49,7 @@ class Keyframe:
 
     Attributes:
         scene: name of the scene.
+        time_s: time of the sample in seconds.
         points: path of the point file, relative to the root.
         images: paths of the images, relative to the root.
         cameras: the cameras in the same order, without images; the calibrations contain the pose of
@@ -55,6 +57,7 @@ class Keyframe:
     """
 
     scene: str
+    time_s: float
     points: str
     images: tuple[str, ...]
     cameras: tuple[Camera, ...]
@@ -83,9 +86,11 @@ def read_keyframes(tables: Path, cameras: Sequence[str]) -> dict[str, Keyframe]:
     path = tables / "scene.json"
     scenes = {token: text(path, record, "name") for token, record in read_table(path).items()}
     path = tables / "sample.json"
+    samples = read_table(path)
     scene_of_sample = {
-        token: text(path, record, "scene_token") for token, record in read_table(path).items()
+        token: text(path, record, "scene_token") for token, record in samples.items()
     }
+    times = {token: microseconds(path, record) / 1e6 for token, record in samples.items()}
     path = tables / "sample_data.json"
     by_channel = _sensor_data(path, sensors)
     complete = {
@@ -107,7 +112,9 @@ def read_keyframes(tables: Path, cameras: Sequence[str]) -> dict[str, Keyframe]:
                 f"{tables / 'sample.json'}: sample {token} is missing or has no valid scene"
             )
         images = [records[camera] for camera in cameras]
-        frames[token] = _keyframe(tables, scene, records[LIDAR], images, sensors, vehicle)
+        frames[token] = _keyframe(
+            tables, scene, times[token], records[LIDAR], images, sensors, vehicle
+        )
     return frames
 
 
@@ -184,6 +191,7 @@ def _vehicle_poses(path: Path, needed: set[str]) -> dict[str, np.ndarray]:
 def _keyframe(
     tables: Path,
     scene: str,
+    time_s: float,
     sweep: Record,
     images: Sequence[Record],
     sensors: Mapping[str, _Sensor],
@@ -194,6 +202,7 @@ def _keyframe(
     path = tables / "sample_data.json"
     return Keyframe(
         scene,
+        time_s,
         text(path, sweep, "filename"),
         tuple(text(path, image, "filename") for image in images),
         tuple(_camera(tables, image, lidar_to_map, sensors, vehicle) for image in images),

@@ -118,6 +118,20 @@ def count(path: Path, record: Record, name: str) -> int:
     return value
 
 
+def microseconds(path: Path, record: Record) -> int:
+    """Return the timestamp of a record.
+
+    Raises:
+        DataError: if it is missing or not an integer from 0.
+    """
+    value = field(path, record, "timestamp")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**63:
+        raise DataError(
+            f"{path}: record {_shown_token(record)}: timestamp is not a number of microseconds"
+        )
+    return value
+
+
 def numbers(path: Path, record: Record, name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of numbers of a record.
 
