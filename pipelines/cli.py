@@ -38,6 +38,7 @@ from pipelines.commands.serve import serve
 from pipelines.commands.simulate import simulate
 from pipelines.commands.solve import solve
 from pipelines.commands.status import status
+from pipelines.commands.suspects import suspects
 from pipelines.commands.train_round import train_round
 from pipelines.commands.view import view
 
@@ -56,7 +57,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
         run,
         export_model,
     ),
-    "Look and ask": (query, explain, view, report, diff, serve, review),
+    "Look and ask": (query, explain, view, report, diff, serve, review, suspects),
     "Measure": (evaluate, audit, bench),
 }
 """The commands under the headings of the help text."""
