@@ -11,7 +11,7 @@ learning (Northcutt et al., "Confident Learning: Estimating Uncertainty in Datas
 2021).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -116,7 +116,11 @@ class Suspect:
 
 @dataclass(frozen=True)
 class _Side:
-    """Labels or predictions of all frames as columns: n rows."""
+    """Labels or predictions of all frames as columns: n rows.
+
+    `hidden` has the occlusion level and the truncation of labels, which explain why an object has
+    few points or pixels, or is not found; zeros for predictions.
+    """
 
     frame: Int[np.ndarray, " n"]
     number: Int[np.ndarray, " n"]
@@ -124,6 +128,7 @@ class _Side:
     boxes: Float[np.ndarray, "n 7"]
     points: Int[np.ndarray, " n"]
     share: Float[np.ndarray, " n"]
+    hidden: Float[np.ndarray, "n 2"]
 
     @property
     def distance(self) -> Float[np.ndarray, " n"]:
@@ -159,7 +164,7 @@ def find_suspects(
         by_label[i].append(finding)
         partner.setdefault(i, j)
     for i, finding in (
-        *_not_found(labels, support, checked),
+        *_not_found(labels, support, checked, set(partner)),
         *_without(labels, checked, "points"),
         *_without(labels, checked, "pixels"),
         *_odd_sizes(labels, checked),
@@ -244,20 +249,27 @@ class _Overlaps:
 
 def _side(frames: Sequence[CheckedFrame], *, of_labels: bool) -> _Side:
     parts = [
-        (each.truth if of_labels else each.found,
-         each.truth_points if of_labels else each.found_points,
-         each.truth_share if of_labels else each.found_share)
+        (each.truth, each.truth_points, each.truth_share, _hidden(each.truth))
+        if of_labels
+        else (each.found, each.found_points, each.found_share, np.zeros((len(each.found), 2)))
         for each in frames
-    ]  # fmt: skip
-    sizes = [len(objects) for objects, _, _ in parts]
+    ]
+    sizes = [len(objects) for objects, *_ in parts]
     return _Side(
         np.repeat(np.arange(len(frames)), sizes),
         np.concatenate([np.zeros(0, np.int64), *(np.arange(size) for size in sizes)]),
-        np.concatenate([np.zeros(0, np.str_), *(each.categories for each, _, _ in parts)]),
-        np.concatenate([np.zeros((0, 7)), *(each.boxes for each, _, _ in parts)]),
-        np.concatenate([np.zeros(0, np.int64), *(points for _, points, _ in parts)]),
-        np.concatenate([np.zeros(0), *(share for _, _, share in parts)]),
+        np.concatenate([np.zeros(0, np.str_), *(each.categories for each, *_ in parts)]),
+        np.concatenate([np.zeros((0, 7)), *(each.boxes for each, *_ in parts)]),
+        np.concatenate([np.zeros(0, np.int64), *(points for _, points, *_ in parts)]),
+        np.concatenate([np.zeros(0), *(share for _, _, share, _ in parts)]),
+        np.concatenate([np.zeros((0, 2)), *(hidden for *_, hidden in parts)]),
     )
+
+
+def _hidden(truth: Annotations) -> np.ndarray:
+    """Return (n, 2) occlusion level and truncation; 0 where a data set does not know them."""
+    known = np.stack([truth.occluded.astype(np.float64), truth.truncated], axis=1)
+    return np.asarray(np.clip(np.nan_to_num(known), 0, [3, 1]))
 
 
 def _overlaps(frames: Sequence[CheckedFrame]) -> _Overlaps:
@@ -290,19 +302,21 @@ def _confidence(
 ) -> np.ndarray:
     """Return (m,) the share of predictions like each one that have a label; 0 if not counted."""
     clipped = np.clip(scores, 1e-4, 1 - 1e-4)
-    columns = [np.log(clipped / (1 - clipped)), *_context(found), _filled(found.share)]
+    columns = [
+        np.log(clipped / (1 - clipped)), np.log1p(found.points), _filled(found.share),
+        _context(found),
+    ]  # fmt: skip
     confidence = np.zeros(len(scores))
     rows = np.flatnonzero(counted)
     confidence[rows] = fit_shares(np.column_stack(columns)[rows], has_label[rows])
     return confidence
 
 
-def _context(side: _Side) -> list[np.ndarray]:
-    """Return points, distance and category as features."""
-    names = np.unique(side.category)
-    return [
-        np.log1p(side.points), side.distance / 10, *(1.0 * (side.category == n) for n in names[1:])
-    ]  # fmt: skip
+def _context(side: _Side) -> np.ndarray:
+    """Return (n, f) distance, category, occlusion and truncation as features."""
+    names = np.unique(side.category)[1:]
+    is_name = (1.0 * (side.category == name) for name in names)
+    return np.column_stack([side.distance / 10, *is_name, side.hidden])
 
 
 def _filled(share: np.ndarray) -> np.ndarray:
@@ -442,38 +456,47 @@ def _odd_sizes(labels: _Side, checked: np.ndarray) -> Iterator[tuple[int, Findin
 
 
 def _not_found(
-    labels: _Side, support: np.ndarray, checked: np.ndarray
+    labels: _Side, support: np.ndarray, checked: np.ndarray, explained: Collection[int]
 ) -> Iterator[tuple[int, Finding]]:
-    """Yield labels without a prediction, by how many like them have one."""
+    """Yield labels without a prediction, by how many like them have one.
+
+    Those with a finding about a prediction, such as one some metres away, are left out.
+    """
     rows = np.flatnonzero(checked)
     is_found = support[rows] >= LEAST_CONFIDENCE
-    features = np.column_stack(_context(labels))[rows]
+    features = np.column_stack([np.log1p(labels.points), _context(labels)])[rows]
     shares = fit_shares(features, is_found)
     for row, share in zip(rows[~is_found].tolist(), shares[~is_found].tolist(), strict=True):
+        if row in explained:
+            continue
         reason = (
             f"not predicted, with {_evidence(labels, row)} at {labels.distance[row]:.0f} m; "
             f"{share:.0%} of such labels are"
         )
-        yield row, Finding("not found", share, reason)
+        yield row, Finding("not found", float(share), reason)
 
 
 def _without(
     labels: _Side, checked: np.ndarray, what: Literal["points", "pixels"]
 ) -> Iterator[tuple[int, Finding]]:
-    """Yield labels without points or pixels, by the share of their category that has some."""
+    """Yield labels without points or pixels, by how many like them have some."""
     known = checked & (~np.isnan(labels.share) if what == "pixels" else True)
     some = labels.points > 0 if what == "points" else labels.share >= LEAST_SHARE
-    for category in np.unique(labels.category[known]):
-        of_category = known & (labels.category == category)
-        share = float((of_category & some).sum() / (of_category.sum() + 1.0))
-        for row in np.flatnonzero(of_category & ~some).tolist():
-            here = (
-                "no LiDAR point lies in the label"
-                if what == "points"
-                else f"{labels.share[row]:.0%} of its image area shows a {category}"
-            )
-            reason = f"{here}; {share:.0%} of {category} labels have more"
-            yield row, Finding(f"no {what}", share, reason)
+    rows = np.flatnonzero(known)
+    features = _context(labels)
+    if what == "pixels":
+        features = np.column_stack([np.log1p(labels.points), features])
+    shares = fit_shares(features[rows], some[rows])
+    for row, share in zip(rows.tolist(), shares.tolist(), strict=True):
+        if some[row]:
+            continue
+        category = labels.category[row]
+        here = (
+            "no LiDAR point lies in the label"
+            if what == "points"
+            else f"{labels.share[row]:.0%} of its image area shows a {category}"
+        )
+        yield row, Finding(f"no {what}", share, f"{here}; {share:.0%} of such labels have more")
 
 
 def _size_deviation(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
