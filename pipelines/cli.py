@@ -25,6 +25,7 @@ from pipelines.commands.export import export
 from pipelines.commands.export_model import export_model
 from pipelines.commands.graph import graph
 from pipelines.commands.init import init
+from pipelines.commands.next import next as next_frames
 from pipelines.commands.predict import predict
 from pipelines.commands.pretrain import pretrain
 from pipelines.commands.query import query
@@ -43,7 +44,7 @@ from pipelines.commands.train_round import train_round
 from pipelines.commands.view import view
 
 GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
-    "Set up": (simulate, demo, init, doctor, check, status, graph),
+    "Set up": (simulate, demo, init, doctor, check, status, graph, next_frames),
     "Stages": (
         pretrain,
         segment,
