@@ -12,22 +12,32 @@ learning (Northcutt et al., "Confident Learning: Estimating Uncertainty in Datas
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from curate.detections import Annotations, Detections
+from curate.evaluation.proposals import Proposals
 from curate.evaluation.reliability import MatchSettings, match_to_ground_truth
 from curate.geometry.overlap import bev_iou
 from curate.geometry.similarity import wrap_angle
 from curate.shapes import Bool, Float, Int, Shaped
 
 Kind = Literal[
-    "missing", "not found", "no points", "no pixels", "category", "position", "size", "heading"
+    "missing",
+    "mask",
+    "not found",
+    "no points",
+    "no pixels",
+    "category",
+    "position",
+    "size",
+    "heading",
 ]
 KINDS: tuple[str, ...] = get_args(Kind)
-"""missing: a confident prediction without a label. The others are findings about a label."""
+"""missing and mask: a confident prediction, or an image mask with points, without a label. The
+others are findings about a label."""
 
 SAME_OBJECT_IOU = 0.1
 """Boxes with a greater BEV IoU are the same object, perhaps with a wrong box or category."""
@@ -56,6 +66,7 @@ class CheckedFrame:
         found_share: (m,) the same for each prediction.
         counted: (m,) bool, False for predictions where labels cannot be expected: in a DontCare
             region, or outside all images if only objects in images are labeled.
+        masks: objects proposed from image masks and points, whether they have a label or not.
     """
 
     frame: str
@@ -66,6 +77,7 @@ class CheckedFrame:
     truth_share: Float[np.ndarray, " n"]
     found_share: Float[np.ndarray, " m"]
     counted: Bool[np.ndarray, " m"]
+    masks: Proposals = field(default_factory=Proposals.empty)
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,7 @@ class Suspect:
         frame: number of the frame in the sequence of checked frames.
         label: number of the label in its frame; -1 for a missing one.
         prediction: number of the prediction that contradicts it; -1 if none does.
+        mask: number of the proposal from a mask that contradicts it; -1 if none does.
         category: category of the label, or of the prediction if the label is missing.
         suspicion: of all findings together, in [0, 1].
         findings: the most suspicious first; at least one.
@@ -102,6 +115,7 @@ class Suspect:
     category: str
     suspicion: float
     findings: tuple[Finding, ...]
+    mask: int = -1
 
     @property
     def kind(self) -> str:
@@ -170,18 +184,39 @@ def find_suspects(
         *_odd_sizes(labels, checked),
     ):
         by_label[i].append(finding)
-    explained = set(partner.values())
+    places = {j: i for i, j in partner.items()}  # of predictions that a wrong label explains
+    by_prediction = {j: [each] for j, each in missing.items() if j not in places}
+    alone = []
+    for mask, finding, j in _unlabeled_masks(frames, missing):
+        if j in places:
+            by_label[places[j]].append(finding)
+        elif j in by_prediction:
+            by_prediction[j].append(finding)
+        else:
+            alone.append((mask, finding))
     suspects = [
-        _suspect(labels, i, findings, int(found.number[partner[i]]) if i in partner else -1)
-        for i, findings in by_label.items()
-        if findings
-    ] + [
-        _suspect(found, j, [finding], int(found.number[j]), is_missing=True)
-        for j, finding in missing.items()
-        if j not in explained
+        *(
+            _suspect(labels, i, findings, int(found.number[partner[i]]) if i in partner else -1)
+            for i, findings in by_label.items()
+            if findings
+        ),
+        *(
+            replace(_suspect(found, j, findings, int(found.number[j])), label=-1)
+            for j, findings in by_prediction.items()
+        ),
+        *(
+            Suspect(
+                frame, -1, -1, str(frames[frame].masks.categories[n]), each.suspicion, (each,), n
+            )
+            for (frame, n), each in alone
+        ),
     ]
     kept = (each for each in suspects if each.suspicion >= minimum)
-    return sorted(kept, key=lambda each: (-each.suspicion, each.frame, each.label, each.prediction))
+    return sorted(kept, key=_rank)
+
+
+def _rank(suspect: Suspect) -> tuple[float, ...]:
+    return -suspect.suspicion, suspect.frame, suspect.label, suspect.prediction, suspect.mask
 
 
 def combined(suspicions: Sequence[float]) -> float:
@@ -338,6 +373,43 @@ def _missing(
         )
         findings[j] = Finding("missing", p, reason)
     return findings
+
+
+def _unlabeled_masks(
+    frames: Sequence[CheckedFrame], missing: Mapping[int, Finding]
+) -> Iterator[tuple[tuple[int, int], Finding, int]]:
+    """Yield the masks without a label: frame and number, the finding, and a prediction there.
+
+    The prediction is the row of one that has no label either, -1 for none.
+    """
+    frame = np.repeat(np.arange(len(frames)), [len(each.masks) for each in frames])
+    if not len(frame):
+        return
+    number = np.concatenate([np.arange(len(each.masks)) for each in frames])
+    boxes = np.concatenate([each.masks.boxes for each in frames])
+    names = np.concatenate([each.masks.categories for each in frames])
+    points = np.concatenate([each.masks.points for each in frames])
+    pixels = np.concatenate([each.masks.pixels for each in frames])
+    has_label = np.concatenate([
+        (bev_iou(each.masks.boxes, each.truth.boxes) > SAME_OBJECT_IOU).any(axis=1)
+        for each in frames
+    ])  # fmt: skip
+    is_name = [1.0 * (names == name) for name in np.unique(names)[1:]]
+    distance = np.hypot(boxes[:, 0], boxes[:, 1])
+    features = np.column_stack([np.log1p(points), np.log1p(pixels), distance / 10, *is_name])
+    shares = fit_shares(features, has_label)
+    starts = np.cumsum([0, *(len(each.found) for each in frames)])
+    for row in np.flatnonzero(~has_label).tolist():
+        found = frames[frame[row]].found
+        overlaps = bev_iou(boxes[row : row + 1], found.boxes)[0] > SAME_OBJECT_IOU
+        rows = [j for j in (starts[frame[row]] + np.flatnonzero(overlaps)).tolist() if j in missing]
+        share = float(shares[row])
+        reason = (
+            f"an image mask of a {names[row]} has {pixels[row]} pixels and {points[row]} points, "
+            f"but no label; {share:.0%} of such masks have one"
+        )
+        best = max(rows, key=lambda j: missing[j].suspicion, default=-1)
+        yield (int(frame[row]), int(number[row])), Finding("mask", share, reason), best
 
 
 def _moved_away(
@@ -514,15 +586,13 @@ def _evidence(side: _Side, row: int) -> str:
     return text if np.isnan(share) else f"{text} and {share:.0%} of its pixels"
 
 
-def _suspect(
-    side: _Side, row: int, findings: Sequence[Finding], prediction: int, *, is_missing: bool = False
-) -> Suspect:
+def _suspect(side: _Side, row: int, findings: Sequence[Finding], prediction: int) -> Suspect:
     """Return the suspect; findings that hardly matter are left out of its reasons."""
     ordered = sorted(findings, key=lambda each: -each.suspicion)
     told = [each for each in ordered if each.suspicion >= 0.5] or ordered[:1]
     return Suspect(
         int(side.frame[row]),
-        -1 if is_missing else int(side.number[row]),
+        int(side.number[row]),
         prediction,
         str(side.category[row]),
         combined([each.suspicion for each in told]),

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from curate.detections import Annotations, Detections
+from curate.detections import Annotations, Detections, empty_boxes
 from curate.errors import ConfigError, CurateError, WorkspaceError
-from curate.evaluation.reliability import MatchSettings, match_to_ground_truth
+from curate.evaluation.proposals import Proposals, mean_sizes, propose_objects
+from curate.evaluation.reliability import DONT_CARE, MatchSettings, match_to_ground_truth
 from curate.evaluation.suspects import CheckedFrame, Suspect, find_suspects
 from curate.files.atomic import replace_file
 from curate.frames import Frame
@@ -220,7 +221,10 @@ class _Measure:
     def __post_init__(self) -> None:
         config = self.workspace.config
         shows = "semantic" in config.run.priors
-        self.prior = SemanticPrior(open_segmenter(config)) if shows else None
+        self.segmenter = open_segmenter(config) if shows else None
+        self.prior = SemanticPrior(self.segmenter) if shows else None
+        truth = list(self.workspace.ground_truth(*SPLITS).values())
+        self.sizes = mean_sizes(truth, config.dataset.categories)
         # Of each frame, whether a camera shows each label and each prediction.
         self.seen: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -250,8 +254,16 @@ class _Measure:
         rectangles = rectangles_in_image(found.boxes, frame)
         neutral = match_to_ground_truth(found, truth, self._settings(), rectangles).neutral
         return CheckedFrame(
-            name, objects, found, points[:n], points[n:], share[:n], share[n:], neutral == ""
-        )
+            name, objects, found, points[:n], points[n:], share[:n], share[n:], neutral == "",
+            self._masks(frame, truth),
+        )  # fmt: skip
+
+    def _masks(self, frame: Frame, truth: Annotations) -> Proposals:
+        """Return the objects that image masks and points propose, outside of DontCare regions."""
+        if self.segmenter is None or not frame.cameras:
+            return Proposals.empty()
+        regions = truth.boxes_2d[truth.categories == DONT_CARE]
+        return propose_objects(frame, self.segmenter, empty_boxes(), self.sizes, regions=regions)
 
     def _settings(self) -> MatchSettings:
         return MatchSettings(minimum_iou=dict.fromkeys(self.workspace.config.dataset.categories, 1))
@@ -355,7 +367,9 @@ def _describe_teachers(workspace: Workspace, splits: Sequence[str], request: Sus
 
 
 def _box(frame: CheckedFrame, suspect: Suspect) -> np.ndarray:
-    """Return (7,) the box of the label, or of the prediction if the label is missing."""
-    boxes = frame.found.boxes if suspect.label < 0 else frame.truth.boxes
-    number = suspect.prediction if suspect.label < 0 else suspect.label
-    return np.asarray(boxes[number])
+    """Return (7,) the box of the label, or of the prediction or mask if the label is missing."""
+    if suspect.label >= 0:
+        return np.asarray(frame.truth.boxes[suspect.label])
+    if suspect.prediction >= 0:
+        return np.asarray(frame.found.boxes[suspect.prediction])
+    return np.asarray(frame.masks.boxes[suspect.mask])

@@ -101,7 +101,7 @@ def trained(folder: Path, config: Config, frames: Sequence[str]) -> Figures:
     thresholds = {"kitti": dict(objects.overlaps), "relaxed": relaxed(objects.overlaps)}
     figure = FIGURES.index("3d")
     return {
-        name: float(known_mean(objects.evaluate(each).ap_r40[:, figure, 1], 0))
+        name: float(known_mean(objects.evaluate(each).ap_r40[:, figure, 1], 1))
         for name, each in thresholds.items()
     }
 

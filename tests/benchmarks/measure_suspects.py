@@ -81,7 +81,11 @@ def hits(found: FoundSuspects, planted: Sequence[Planted]) -> Iterator[set[int]]
     """Yield the planted errors at which each suspect points: its label, or the true box."""
     for suspect in found.suspects:
         frame = found.frames[suspect.frame]
-        sides = ((frame.found, suspect.prediction), (frame.truth, suspect.label))
+        sides = (
+            (frame.found, suspect.prediction),
+            (frame.truth, suspect.label),
+            (frame.masks, suspect.mask),
+        )
         boxes = [objects.boxes[number] for objects, number in sides if number >= 0]
         yield {
             n

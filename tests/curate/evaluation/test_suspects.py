@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from curate.detections import Annotations, Detections, as_categories
+from curate.evaluation.proposals import Proposals
 from curate.evaluation.suspects import (
     CheckedFrame,
     Suspect,
@@ -140,6 +141,30 @@ def test_hidden_labels_are_less_suspicious() -> None:
     frames[-1].truth_share[0] = 0.0
     [suspect] = find_suspects(frames, ("Car", "Pedestrian"))
     assert (suspect.frame, suspect.kind) == (11, "no pixels")
+
+
+def with_masks(frame: CheckedFrame, boxes: np.ndarray) -> CheckedFrame:
+    """Return the frame with a large mask of a car at each box."""
+    n = len(boxes)
+    names, counts = as_categories(["Car"] * n), np.full(n, 50)
+    return replace(frame, masks=Proposals(boxes, names, counts, counts, as_categories([""] * n)))
+
+
+def test_masks_without_a_label_are_suspicious() -> None:
+    """Alone, with a prediction that has no label, and not where there is a label."""
+    truth = [scene(seed).truth.boxes[:4] for seed in range(12)]
+    masked = [with_masks(frame, truth[n]) for n, frame in enumerate(scenes(scene(0)))]
+    assert find_suspects(masked, ("Car", "Pedestrian")) == []
+    elsewhere = truth[0][:1] + [0, 60, 0, 0, 0, 0, 0]
+    masked[0] = with_masks(scene(0), np.concatenate([truth[0], elsewhere]))
+    [alone] = find_suspects(masked, ("Car", "Pedestrian"))
+    assert (alone.frame, alone.label, alone.prediction, alone.mask) == (0, -1, -1, 4)
+    assert "50 pixels and 50 points, but no label" in alone.reason
+    masked[0] = with_masks(without_label(scene(0), 2), truth[0])
+    [both] = find_suspects(masked, ("Car", "Pedestrian"))
+    assert (both.label, both.prediction) == (-1, 2)
+    assert {finding.kind for finding in both.findings} == {"missing", "mask"}
+    assert both.suspicion > max(finding.suspicion for finding in both.findings)
 
 
 def test_predictions_that_do_not_count_are_not_missing_labels() -> None:
