@@ -28,6 +28,7 @@ from pipelines.commands.init import init
 from pipelines.commands.next import next as next_frames
 from pipelines.commands.predict import predict
 from pipelines.commands.pretrain import pretrain
+from pipelines.commands.propose import propose
 from pipelines.commands.query import query
 from pipelines.commands.report import report
 from pipelines.commands.repredict import repredict
@@ -58,7 +59,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
         run,
         export_model,
     ),
-    "Look and ask": (query, explain, view, report, diff, serve, review, suspects),
+    "Look and ask": (query, explain, view, report, diff, serve, review, suspects, propose),
     "Measure": (evaluate, audit, bench),
 }
 """The commands under the headings of the help text."""

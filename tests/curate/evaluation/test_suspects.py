@@ -155,7 +155,7 @@ def test_masks_without_a_label_are_suspicious() -> None:
     truth = [scene(seed).truth.boxes[:4] for seed in range(12)]
     masked = [with_masks(frame, truth[n]) for n, frame in enumerate(scenes(scene(0)))]
     assert find_suspects(masked, ("Car", "Pedestrian")) == []
-    elsewhere = truth[0][:1] + [0, 60, 0, 0, 0, 0, 0]
+    elsewhere = truth[0][:1] + np.array([0, 14, 0, 0, 0, 0, 0])
     masked[0] = with_masks(scene(0), np.concatenate([truth[0], elsewhere]))
     [alone] = find_suspects(masked, ("Car", "Pedestrian"))
     assert (alone.frame, alone.label, alone.prediction, alone.mask) == (0, -1, -1, 4)
