@@ -29,9 +29,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     options = parser.parse_args()
     simulate(options.folder, options.frames, 7, val_frames=1, workers=1)
-    document = {"dataset": {"root": options.folder}, "segmenter": {"name": "simulated"}}
+    document = {
+        "dataset": {"root": options.folder},
+        "segmenter": {"name": "simulated", "cache": options.folder / "maps"},
+    }
     config = make_config(document, "measure_proposals")
-    config.segmenter.cache = options.folder / "maps"
     segmenter, dataset = open_segmenter(config), KittiDataset(options.folder)
     truth = {name: dataset.annotations(name) for name in dataset.frame_ids()}
     sizes = mean_sizes(list(truth.values()), CATEGORIES)
