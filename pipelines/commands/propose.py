@@ -32,9 +32,9 @@ def propose(
     Example: curate propose && curate review export to-review --by proposals
     """
     from curate.errors import FramesFailed
-    from pipelines.assessment.proposals import propose as propose_objects
     from pipelines.category_names import check_names
     from pipelines.engine.progress import Bar
+    from pipelines.stages.propose import propose as propose_objects
 
     opened = open_workspace(workspace, executor, workers)
     check_names(opened)

@@ -1,4 +1,7 @@
-"""Propose objects that have no label, and store them in the table `proposal` for review."""
+"""propose: objects that have no label, stored in the table `proposal` for review.
+
+It is not a stage of the graph: nothing but people and `train.ignore_proposals` uses its results.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -10,6 +13,7 @@ import numpy as np
 from sqlalchemy import select
 
 from curate.detections import Annotations, Detections, as_categories, empty_boxes
+from curate.detectors.base import IgnoredRegions
 from curate.errors import ConfigError, FramesFailed, WorkspaceError
 from curate.evaluation.proposals import PROVENANCE, mean_sizes, propose_objects
 from db import bulk
@@ -146,14 +150,7 @@ def _checked_sizes(workspace: Workspace, split: str) -> dict[str, np.ndarray]:
     if split not in SPLITS:
         raise ConfigError(f"--split {split}: use one of {', '.join(SPLITS)}")
     check_executor(config)
-    if config.segmenter.name == "none":
-        raise ConfigError(
-            "segmenter.name is 'none', and proposals are made from its masks; set segmenter.name "
-            "and segmenter.path in curate.toml"
-        )
-    if reason := why_not_segmented(config, workspace.dataset):
-        raise ConfigError(f"no proposals: {reason}")
-    check_segmenter_names(config)
+    check_proposable(workspace)
     if not workspace.frames(split):
         raise WorkspaceError(f"there are no {split} frames")
     truth = list(workspace.ground_truth("labeled").values())
@@ -164,6 +161,19 @@ def _checked_sizes(workspace: Workspace, split: str) -> dict[str, np.ndarray]:
             "unknown; label some frames first"
         )
     return sizes
+
+
+def check_proposable(workspace: Workspace) -> None:
+    """Raise ConfigError if there is no segmenter, or nothing for it to segment."""
+    config = workspace.config
+    if config.segmenter.name == "none":
+        raise ConfigError(
+            "segmenter.name is 'none', and proposals are made from its masks; set segmenter.name "
+            "and segmenter.path in curate.toml"
+        )
+    if reason := why_not_segmented(config, workspace.dataset):
+        raise ConfigError(f"no proposals: {reason}")
+    check_segmenter_names(config)
 
 
 def _run(
@@ -181,6 +191,21 @@ def _run(
                 rows += [(job.frame_id, found["proposal"]) for job, found in pairs]
             advance(len(outcome.job.frames), "")
     return rows, failed
+
+
+def proposed_regions(workspace: Workspace, round_number: int) -> IgnoredRegions:
+    """Return the stored proposals of the unlabeled frames by frame name, for a training."""
+    table, frame = bulk.table("proposal"), bulk.table("frame")
+    query = (
+        select(frame.c.frame, table.c.category, *(table.c[name] for name in BOX_COLUMNS))
+        .join(frame, frame.c.id == table.c.frame_id)
+        .where(table.c.round == round_number, frame.c.split == "unlabeled")
+        .order_by(frame.c.frame, table.c.n)
+    )
+    return {
+        name: (np.array([row[1:] for row in rows]), as_categories([row[0] for row in rows]))
+        for name, rows in bulk.grouped(workspace.database.rows(query)).items()
+    }
 
 
 def _weighted_labels(

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -111,3 +112,45 @@ def test_bad_input_is_reported_in_one_line(curate: Curate, cars: Workspace) -> N
     path.write_text(text)
     change(cars, "DELETE FROM ground_truth")
     fails("the labeled frames have no object of dataset.categories", "--split", "val")
+
+
+def test_students_ignore_the_proposals_if_asked_to(
+    curate: Curate, cars: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The training gets the regions of the round; the setting does not change the first teacher."""
+    path = cars.root / "curate.toml"
+    text = path.read_text().replace(
+        "support.toys:ToyDetector", "support.trainable_toy:GridDetector"
+    )
+    text = re.sub(r"^path = .*detector.txt.*\n", "", text, count=1, flags=re.MULTILINE)
+    text = re.sub(r"_steps = \d+", "_steps = 4", text)
+    path.write_text(text)
+    for command in ("pretrain", "predict", "repredict", "score", "solve"):
+        code, _, err = curate(command, "-w", cars.root)
+        assert code == 0, err
+    from curate.training import trainer
+
+    given = []
+    train = trainer.train
+
+    def recorded(*arguments: object, **options: object):
+        given.append(options["regions"])
+        return train(*arguments, **options)
+
+    monkeypatch.setattr(trainer, "train", recorded)
+    change(cars, "UPDATE weight SET v = 0")
+    assert curate("export", "-w", cars.root, "--allow-empty")[0] == 0
+    path.write_text(text.replace("ignore_proposals = false", "ignore_proposals = true"))
+    code, out, _ = curate("pretrain", "-w", cars.root)
+    assert "up to date" in out
+    code, _, err = curate("train-round", "-w", cars.root, "--allow-empty", "--round", 1)
+    assert code == 0, err
+    [regions] = given
+    boxes, categories = next(iter(regions.values()))
+    assert set(regions) <= set(cars.frames("unlabeled"))
+    assert boxes.shape == (1, 7)
+    assert categories.tolist() == ["Car"]
+    path.write_text(path.read_text().replace("support.car_masks:TrueCars", "none"))
+    code, _, err = curate("train-round", "-w", cars.root, "--round", 1)
+    assert code == 2
+    assert "segmenter.name is 'none'" in err
