@@ -16,9 +16,9 @@ from curate.review.next_frames import (
 
 def gains(amount: list[list[float]], boxes: list[float]) -> FrameGains:
     """Return gains with these amounts, as changes of weights."""
-    change = np.array(amount, dtype=np.float64)
+    change = np.array(amount, dtype=np.float64).reshape(len(boxes), -1 if boxes else 1)
     nothing = np.zeros_like(change)
-    return FrameGains(change, nothing, np.array(boxes), nothing.astype(np.int64))
+    return FrameGains(change, nothing, np.array(boxes, dtype=np.float64), nothing.astype(np.int64))
 
 
 def names(found: list) -> list[int]:
@@ -80,7 +80,7 @@ def test_no_more_frames_than_there_are() -> None:
     """Frames without labels are the last."""
     some = gains([[0.0], [1.0], [0.0]], [0.0, 1.0, 0.0])
     assert names(choose_frames(some, 9, np.array([0.0]))) == [1, 0, 2]
-    assert choose_frames(gains(np.zeros((0, 1)).tolist(), []), 3, np.zeros(0)) == []
+    assert choose_frames(gains([], []), 3, np.zeros(0)) == []
 
 
 def test_the_greedy_choice_is_nearly_the_best() -> None:
