@@ -32,7 +32,7 @@ from pipelines.assembly import check_executor, open_segmenter
 from pipelines.assessment.audit_folds import open_folds
 from pipelines.assessment.evaluation import rectangles_in_image
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import is_trainable
+from pipelines.engine.rounds import is_trainable, recorded_config
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.round import graph_of, open_plan
 from pipelines.workspace.workspace import Workspace
@@ -303,6 +303,9 @@ def _splits_to_check(workspace: Workspace, request: SuspectRequest) -> tuple[str
             )
     if not 0 <= request.minimum <= 1:
         raise ConfigError(f"--minimum {request.minimum:g}: must be from 0 to 1")
+    number, rounds = request.round_number, workspace.config.run.rounds
+    if number is not None and number > rounds and recorded_config(workspace, number) is None:
+        raise ConfigError(f"--round {number}: there is no such round; run.rounds is {rounds}")
     counts = {split: len(workspace.frames(split)) for split in SPLITS}
     found = tuple(split for split in SPLITS if split in request.splits and counts[split])
     if not found:

@@ -6,8 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, select
 
+from curate.detections import empty_boxes
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.label_changes import compare_labels
+from curate.geometry.overlap import bev_iou
+from curate.review.human_labels import SAME_OBJECT_IOU
 from curate.review.sheet import Sheet, ShownBox, ShownFrame
 from db import bulk
 from db.models import BOX_COLUMNS
@@ -172,7 +175,7 @@ def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequ
 def _proposed(
     workspace: Workspace, number: int, request: ReviewRequest
 ) -> Mapping[str, list[ShownBox]]:
-    """Return the stored proposals with the most points, by frame.
+    """Return the stored proposals with the most points, by frame, without decided ones.
 
     Raises:
         WorkspaceError: if there is none to review.
@@ -184,15 +187,19 @@ def _proposed(
         .join(frame, frame.c.id == table.c.frame_id)
         .where(table.c.round == number, frame.c.split == "unlabeled")
         .order_by(table.c.points.desc(), frame.c.frame, table.c.n)
-        .limit(request.count)
     )
     if request.frames:
         query = query.where(frame.c.frame.in_(request.frames))
     if request.categories:
         query = query.where(table.c.category.in_(request.categories))
+    decided = decided_boxes(workspace)
     found: dict[str, list[ShownBox]] = {}
     for name, n, category, *box in workspace.database.rows(query):
+        if sum(map(len, found.values())) == request.count:
+            break
         place = tuple(map(float, box))
+        if (bev_iou(np.array([place]), decided.get(name, empty_boxes())) > SAME_OBJECT_IOU).any():
+            continue
         shown = ShownBox(FIRST_PROPOSAL_K + int(n), str(category), place, 0.0, 0.0, asked=True)
         found.setdefault(str(name), []).append(shown)
     if not found:
@@ -200,6 +207,16 @@ def _proposed(
             f"round {number} has no such proposals to review; run `curate propose --round {number}`"
         )
     return found
+
+
+def decided_boxes(workspace: Workspace) -> Mapping[str, np.ndarray]:
+    """Return the boxes that people decided about, by frame."""
+    label, frame = bulk.table("human_label"), bulk.table("frame")
+    query = select(frame.c.frame, *(label.c[name] for name in BOX_COLUMNS)).join(
+        frame, frame.c.id == label.c.frame_id
+    )
+    rows = bulk.grouped(workspace.database.rows(query))
+    return {name: np.array(boxes, dtype=np.float64) for name, boxes in rows.items()}
 
 
 def _human_labels(workspace: Workspace, number: int, policy: str) -> LabelKeys:

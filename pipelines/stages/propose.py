@@ -27,7 +27,7 @@ from pipelines.engine.runner import open_executor
 from pipelines.labels.by_frame import not_weighted_error, weighted_round
 from pipelines.labels.columns import read_columns
 from pipelines.labels.of_one_frame import chosen_round
-from pipelines.review.selection import CONTEXT_WEIGHT
+from pipelines.review.selection import CONTEXT_WEIGHT, decided_boxes
 from pipelines.stages.reading import FrameReader, ReadsAhead
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import why_not_segmented
@@ -220,18 +220,9 @@ def _weighted_labels(
     of_frame: dict[str, list[np.ndarray]] = {}
     for row in np.flatnonzero(found.weights >= CONTEXT_WEIGHT).tolist():
         of_frame.setdefault(found.frame_names[found.frames[row]], []).append(found.boxes[row])
-    for name, box in _decided_boxes(workspace):
-        of_frame.setdefault(name, []).append(box)
+    for name, boxes in decided_boxes(workspace).items():
+        of_frame.setdefault(name, []).extend(boxes)
     return number, {name: np.array(boxes) for name, boxes in of_frame.items()}
-
-
-def _decided_boxes(workspace: Workspace) -> list[tuple[str, np.ndarray]]:
-    """Return the boxes that people decided about; a rejected proposal is not made again."""
-    label, frame = bulk.table("human_label"), bulk.table("frame")
-    query = select(frame.c.frame, *(label.c[name] for name in BOX_COLUMNS)).join(
-        frame, frame.c.id == label.c.frame_id
-    )
-    return [(name, np.array(box)) for name, *box in workspace.database.rows(query)]
 
 
 def _store(

@@ -116,7 +116,8 @@ def test_an_unreadable_frame_is_left_out_with_a_warning(
     [
         (("--split", "unlabeled"), "--split unlabeled: use labeled, val or all"),
         (("--minimum", 2), "--minimum 2: must be from 0 to 1"),
-        (("--round", 7), "round 7 has no teacher yet"),
+        (("--round", 7), "--round 7: there is no such round; run.rounds is 3"),
+        (("--round", 2), "round 2 has no teacher yet; run `curate train-round --round 1`"),
         (("--output", "/nowhere/table.csv"), "must be a file in an existing folder"),
     ],
 )

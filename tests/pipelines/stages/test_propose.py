@@ -72,6 +72,11 @@ def test_objects_without_a_label_are_proposed_reviewed_and_in_no_export(
     code, out, err = curate("review", "import", folder, *options)
     assert code == 0, err
     assert "1 accepted" in out
+    code, out, err = curate(
+        "review", "export", tmp_path / "rest", *options, "--by", "proposals", "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["asked"] == len(rows) - 1
     assert curate("propose", *options)[0] == 0
     assert len(stored(cars)) == len(rows) - 1
     code, out, _ = curate(
