@@ -524,6 +524,37 @@ class HumanMatch(Base):
     )
 
 
+class Proposal(Box, Base):
+    """A candidate for a missed object: an image mask without a label, boxed by its LiDAR points.
+
+    It is for review. It has no weight and is in no export and no view of labels.
+    """
+
+    __tablename__ = "proposal"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[Key] = mapped_column(
+        comment="whose labels lack it; 0 = ground truth",
+        doc="round with the labels that lack it; 0 = ground truth lacks it",
+    )
+    frame_id: Mapped[int] = mapped_column(ForeignKey("frame.id"), primary_key=True, doc="frame.id")
+    n: Mapped[Key] = mapped_column(doc="number of the proposal within its frame")
+    category: Mapped[str] = mapped_column(doc="category of the mask")
+    points: Mapped[int] = mapped_column(
+        sort_order=1, comment="of the object", doc="LiDAR points of the object"
+    )
+    pixels: Mapped[int] = mapped_column(
+        sort_order=1,
+        comment="of its mask that no label covers",
+        doc="pixels of its mask that no label covers",
+        info={"unit": "px"},
+    )
+    camera: Mapped[str | None] = mapped_column(
+        sort_order=1, comment="of several; null = one", doc="its camera; null = only one camera"
+    )
+    provenance: Mapped[str] = mapped_column(sort_order=1, doc="always proposal")
+
+
 class _Audited:
     """The key columns of the audit tables."""
 

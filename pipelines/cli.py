@@ -25,8 +25,10 @@ from pipelines.commands.export import export
 from pipelines.commands.export_model import export_model
 from pipelines.commands.graph import graph
 from pipelines.commands.init import init
+from pipelines.commands.next import next as next_frames
 from pipelines.commands.predict import predict
 from pipelines.commands.pretrain import pretrain
+from pipelines.commands.propose import propose
 from pipelines.commands.query import query
 from pipelines.commands.report import report
 from pipelines.commands.repredict import repredict
@@ -38,11 +40,12 @@ from pipelines.commands.serve import serve
 from pipelines.commands.simulate import simulate
 from pipelines.commands.solve import solve
 from pipelines.commands.status import status
+from pipelines.commands.suspects import suspects
 from pipelines.commands.train_round import train_round
 from pipelines.commands.view import view
 
 GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
-    "Set up": (simulate, demo, init, doctor, check, status, graph),
+    "Set up": (simulate, demo, init, doctor, check, status, graph, next_frames),
     "Stages": (
         pretrain,
         segment,
@@ -56,7 +59,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
         run,
         export_model,
     ),
-    "Look and ask": (query, explain, view, report, diff, serve, review),
+    "Look and ask": (query, explain, view, report, diff, serve, review, suspects, propose),
     "Measure": (evaluate, audit, bench),
 }
 """The commands under the headings of the help text."""

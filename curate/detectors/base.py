@@ -160,6 +160,10 @@ class ExportsOnnx(Protocol):
         ...
 
 
+IgnoredRegions = Mapping[str, tuple[Float[np.ndarray, "n 7"], Shaped[np.ndarray, " n"]]]
+"""Boxes of regions to ignore, and their categories, by frame."""
+
+
 @dataclass(frozen=True)
 class Sample:
     """One training frame with its weighted labels.
@@ -173,6 +177,8 @@ class Sample:
         weights: (m,) v in [0, 1]; 1 for ground truth.
         zero_weight: meaning of a pseudo-label of weight 0: "background" (not an object) or a region
             to "ignore". It comes from the policy, through the label file.
+        regions: (m,) bool, boxes of weight 0 that are regions to ignore in any case, such as
+            proposals for missed objects; None for none.
     """
 
     frame_id: str
@@ -182,12 +188,15 @@ class Sample:
     categories: Shaped[np.ndarray, " m"]
     weights: Float[np.ndarray, " m"]
     zero_weight: ZeroWeight = "ignore"
+    regions: Bool[np.ndarray, " m"] | None = None
 
     @property
     def ignored(self) -> Bool[np.ndarray, " m"]:
         """(m,) bool, true for boxes that are ignore regions: neither object nor background."""
-        zero = self.weights == 0
-        return zero if self.labeled or self.zero_weight == "ignore" else np.zeros_like(zero)
+        zero = np.asarray(self.weights == 0)
+        if self.labeled or self.zero_weight == "ignore":
+            return zero
+        return np.asarray(zero & (False if self.regions is None else self.regions))
 
     @cached_property
     def ground(self) -> GroundMap:

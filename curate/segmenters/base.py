@@ -8,7 +8,7 @@ import numpy as np
 
 from curate.errors import ModelError
 from curate.frames import Frame
-from curate.shapes import UInt8
+from curate.shapes import Int, UInt8
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,13 @@ class SemanticMap:
         class_ids: (height, width) uint8.
         category_classes: for each category, the class ids that count as its pixels, e.g. bicycle
             and person for Cyclist.
+        instances: (height, width) number of the object from 1, 0 for none; None if the segmenter
+            does not tell objects apart. They are not stored with the maps.
     """
 
     class_ids: UInt8[np.ndarray, "height width"]
     category_classes: Mapping[str, tuple[int, ...]]
+    instances: Int[np.ndarray, "height width"] | None = None
 
 
 def image_size_of(frame: Frame) -> tuple[int, int]:

@@ -92,6 +92,7 @@ class InstanceSegmenter(Segmenter):
         used_ids = {class_id for ids in self.classes.values() for class_id in ids}
         background = background_id(self.classes)
         class_ids = np.full((height, width), background, dtype=np.uint8)
+        instances = np.zeros((height, width), dtype=np.int64)
         source, objects = self._objects(frame.frame_id, frame.camera)
         scored = [(_score(source, number, entry), number) for number, entry in enumerate(objects)]
         for score, number in sorted(scored, key=lambda pair: pair[0]):
@@ -108,7 +109,8 @@ class InstanceSegmenter(Segmenter):
             if not isinstance(category, int):
                 raise DataError(f"{source}: object {number}: category_id is not an integer")
             class_ids[mask] = category if category in used_ids else background
-        return SemanticMap(class_ids, self.classes)
+            instances[mask] = number + 1 if category in used_ids else 0
+        return SemanticMap(class_ids, self.classes, instances)
 
     def _objects(self, frame_id: str, camera: str) -> tuple[str, Objects]:
         """Return the place of a frame's objects, for error messages, and the objects."""

@@ -50,6 +50,7 @@ class Augmentation:
             boxes=similarity.apply_to_boxes(sample.boxes),
             weights=np.where(visible, sample.weights, 0.0),
             zero_weight="ignore",
+            regions=None,
         )
 
 
@@ -61,4 +62,5 @@ def _without_background(sample: Sample) -> Sample:
         boxes=sample.boxes[kept],
         categories=sample.categories[kept],
         weights=sample.weights[kept],
+        regions=None if sample.regions is None else sample.regions[kept],
     )

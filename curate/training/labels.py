@@ -9,7 +9,7 @@ It needs only the exported file and the frames that the file lists, no workspace
 
 import sqlite3
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final, Self
 
@@ -18,7 +18,7 @@ import torch
 from torch.utils.data import Dataset
 
 from curate.detections import as_categories
-from curate.detectors.base import Sample
+from curate.detectors.base import IgnoredRegions, Sample
 from curate.errors import DataError
 from curate.exporters.label_file import (
     check_leakage,
@@ -83,6 +83,7 @@ class WeightedLabels(Dataset[Sample]):
         read: returns the frame of a frame id; by default reads KITTI's layout below the root of the
             data set that the file specifies.
         root: current root of that data set, if it has moved since the export.
+        regions: regions of unlabeled frames to ignore, such as proposals for missed objects.
 
     Raises:
         DataError: if the file is missing, damaged, or not a label file of this version.
@@ -95,10 +96,12 @@ class WeightedLabels(Dataset[Sample]):
         *,
         read: Callable[[str], Frame] | None = None,
         root: StrPath | None = None,
+        regions: IgnoredRegions | None = None,
     ) -> None:
         path = Path(path)
         with open_label_file(path) as rows:
             self._load(rows, path)
+        self._regions = dict(regions or {})
         self._read = read or _kitti_reader(root or self.meta["root"])
 
     def _load(self, rows: sqlite3.Connection, path: Path) -> None:
@@ -137,7 +140,8 @@ class WeightedLabels(Dataset[Sample]):
         boxes, categories, weights = self._boxes[frame_id]
         labeled = bool(self.labeled[index])
         points = frame.points[in_camera_view(frame)]
-        return Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
+        sample = Sample(frame_id, labeled, points, boxes, categories, weights, self.zero_weight)
+        return sample if labeled else _with_regions(sample, self._regions, self.categories)
 
     def collate(self, samples: Sequence[Sample]) -> LabelBatch:
         """Return samples as one batch of tensors: `DataLoader(..., collate_fn=labels.collate)`."""
@@ -158,6 +162,22 @@ class WeightedLabels(Dataset[Sample]):
             categories=numbers[:, 7].long(),
             weights=torch.from_numpy(np.concatenate(weights)).float(),
         )
+
+
+def _with_regions(sample: Sample, regions: IgnoredRegions, categories: Sequence[str]) -> Sample:
+    """Return the sample with the regions of its frame, boxes of weight 0."""
+    if sample.frame_id not in regions:
+        return sample
+    boxes, names = regions[sample.frame_id]
+    known = np.isin(names, categories)
+    count = int(known.sum())
+    return replace(
+        sample,
+        boxes=np.concatenate([sample.boxes, boxes[known]]),
+        categories=np.concatenate([sample.categories, names[known]]),
+        weights=np.concatenate([sample.weights, np.zeros(count)]),
+        regions=np.repeat([False, True], [len(sample.boxes), count]),
+    )
 
 
 def _frame_numbers(counts: Sequence[int]) -> torch.Tensor:

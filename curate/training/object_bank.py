@@ -131,6 +131,9 @@ def paste_objects(
         boxes=np.concatenate([sample.boxes, boxes[accepted]]),
         categories=as_categories([*sample.categories.tolist(), *names]),
         weights=np.concatenate([sample.weights, np.ones(len(accepted))]),
+        regions=None
+        if sample.regions is None
+        else np.concatenate([sample.regions, np.full(len(accepted), False)]),
     )
 
 

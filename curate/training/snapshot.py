@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from curate.detectors.base import TrainableDetector
+from curate.detectors.base import IgnoredRegions, TrainableDetector
 from curate.training.settings import TrainingSettings
 
 _log = logging.getLogger(__name__)
@@ -28,6 +28,7 @@ def fingerprint(
     settings: TrainingSettings,
     start: Path | None,
     options: Mapping[str, Any],
+    regions: IgnoredRegions | None = None,
 ) -> str:
     """Return the SHA-256, in hexadecimal, of everything that a training's result depends on.
 
@@ -37,6 +38,7 @@ def fingerprint(
         settings: the settings.
         start: checkpoint to start from.
         options: the options that the start checkpoint is loaded with; the content of files counts.
+        regions: regions to ignore.
     """
     relevant = {key: value for key, value in asdict(settings).items() if key not in _WITHOUT_EFFECT}
     trained = [detector.__module__, detector.__qualname__, detector.checkpoint_version]
@@ -47,6 +49,8 @@ def fingerprint(
         digest.update(f"{name}={value}".encode())
         if isinstance(value, str | Path) and Path(value).is_file():
             digest.update(Path(value).read_bytes())
+    for frame, (boxes, categories) in sorted((regions or {}).items()):
+        digest.update(f"{frame}={boxes.tolist()}{categories.tolist()}".encode())
     return digest.hexdigest()
 
 

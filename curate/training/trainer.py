@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from curate.detectors.base import Student, TrainableDetector, choose_preset
+from curate.detectors.base import IgnoredRegions, Student, TrainableDetector, choose_preset
 from curate.detectors.devices import check_device
 from curate.errors import ConfigError, CurateError, ProcessDied
 from curate.files.atomic import replace_file
@@ -54,6 +54,7 @@ def train(
     read: Callable[[str], Frame] | None = None,
     progress: Progress | None = None,
     launch: Launch = run_in_processes,
+    regions: IgnoredRegions | None = None,
 ) -> TrainingReport:
     """Train a detector and write the checkpoint of the student or of its moving average.
 
@@ -75,6 +76,7 @@ def train(
         read: see `WeightedLabels`.
         progress: called after every step with the step, the number of steps and the loss.
         launch: starts the processes if there are several; by default on this machine.
+        regions: regions of unlabeled frames to ignore, see `WeightedLabels`.
 
     Raises:
         DataError: if the labels or a frame cannot be read.
@@ -90,12 +92,12 @@ def train(
     labels, output = Path(labels), Path(output)
     start = None if start is None else Path(start)
     settings = replace(settings, preset=choose_preset(detector, settings.preset))
-    samples = WeightedLabels(labels, read=read)
+    samples = WeightedLabels(labels, read=read, regions=regions)
     processes = _useful_processes(settings, samples)
     options = _options_of_start(detector, start, options or {})
     student = _first_student(detector, settings, samples.categories, start, options)
     check_device(settings.device)
-    mark = fingerprint(detector, labels, settings, start, options)
+    mark = fingerprint(detector, labels, settings, start, options, regions)
     writer = _Writer(labels, output, settings.steps, progress)
     while True:
         snapshot = find_snapshot(output, mark)

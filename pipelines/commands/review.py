@@ -39,7 +39,8 @@ def export_review(
     policy: PolicyOption = None,
     count: Annotated[int, typer.Option(min=1, help="Number of labels to review.")] = 100,
     order: Annotated[
-        str, typer.Option("--by", help="Labels to review first: uncertain, lowest or changed.")
+        str,
+        typer.Option("--by", help="What to review first: uncertain, lowest, changed or proposals."),
     ] = "uncertain",
     frames: Annotated[
         str, typer.Option(help="Only these frames, comma-separated; exported even without labels.")
@@ -59,9 +60,10 @@ def export_review(
     """Export the least certain labels for an editor, with images of their frames.
 
     --by chooses which labels come first. uncertain: weight nearest to 0.5. lowest: lowest weight,
-    ties by highest score. changed: largest change since the previous round. The other labels of
-    these frames with a weight of at least 0.1 are exported as context and can be corrected, too.
-    docs/review.md has an example.
+    ties by highest score. changed: largest change since the previous round. proposals: the missed
+    objects of `curate propose`, those with the most points. The other labels of these frames with a
+    weight of at least 0.1 are exported as context and can be corrected, too. docs/review.md has an
+    example.
 
     Example: curate review export to-review --count 50 --category Pedestrian,Cyclist
     """

@@ -1,13 +1,16 @@
 """Select the labels of a round to review, with other labels of their frames as context."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, select
 
+from curate.detections import empty_boxes
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.label_changes import compare_labels
+from curate.geometry.overlap import bev_iou
+from curate.review.human_labels import SAME_OBJECT_IOU
 from curate.review.sheet import Sheet, ShownBox, ShownFrame
 from db import bulk
 from db.models import BOX_COLUMNS
@@ -17,11 +20,14 @@ from pipelines.labels.columns import as_rounds, read_columns
 from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace
 
-ORDERS = ("uncertain", "lowest", "changed")
+ORDERS = ("uncertain", "lowest", "changed", "proposals")
 EVEN_ODDS = 0.5
 """The nearer a weight is to this, the less certain the label is."""
 CONTEXT_WEIGHT = 0.1
 """Other labels of the same frames are shown as context if their weight is at least this."""
+
+FIRST_PROPOSAL_K = 2_000_000
+"""Proposal n of a frame is shown with k = 2000000 + n."""
 
 LabelKeys = Collection[tuple[str, int]]
 """Labels by frame name and number k."""
@@ -34,7 +40,8 @@ class ReviewRequest:
     Attributes:
         count: maximum number of labels.
         order: what comes first. uncertain: weight nearest to 0.5; lowest: lowest weight, ties by
-            highest score; changed: largest change of the weight since the previous round.
+            highest score; changed: largest change of the weight since the previous round;
+            proposals: no labels, but the proposals of `curate propose` with the most points.
         frames: only labels of these frames, which are exported even without labels; empty for all.
         categories: only labels of these categories; empty for all.
     """
@@ -64,13 +71,21 @@ def make_sheet(
     """
     request = _checked(workspace, request)
     number = _weighted_round(workspace, round_number, policy)
-    selected = _changed(workspace, number, policy, request) if request.order == "changed" else None
+    selected: LabelKeys | None = None
+    proposed: Mapping[str, list[ShownBox]] = {}
+    if request.order == "changed":
+        selected = _changed(workspace, number, policy, request)
+    elif request.order == "proposals":
+        selected, proposed = (), _proposed(workspace, number, request)
     with workspace.database.reading() as connection:
         if selected is None:
             selected = _first(connection, number, policy, request)
-        names = sorted({*request.frames, *(frame for frame, _ in selected)})
+        names = sorted({*request.frames, *proposed, *(frame for frame, _ in selected)})
         frames = tuple(
-            ShownFrame(name, tuple(_shown(connection, number, policy, name, selected)))
+            ShownFrame(
+                name,
+                (*_shown(connection, number, policy, name, selected), *proposed.get(name, ())),
+            )
             for name in names
         )
     if not frames:
@@ -155,6 +170,53 @@ def _changed(workspace: Workspace, number: int, policy: str, request: ReviewRequ
         if len(selected) == request.count:
             break
     return selected.keys()
+
+
+def _proposed(
+    workspace: Workspace, number: int, request: ReviewRequest
+) -> Mapping[str, list[ShownBox]]:
+    """Return the stored proposals with the most points, by frame, without decided ones.
+
+    Raises:
+        WorkspaceError: if there is none to review.
+    """
+    table, frame = bulk.table("proposal"), bulk.table("frame")
+    names = ("n", "category", *BOX_COLUMNS)
+    query = (
+        select(frame.c.frame, *(table.c[name] for name in names))
+        .join(frame, frame.c.id == table.c.frame_id)
+        .where(table.c.round == number, frame.c.split == "unlabeled")
+        .order_by(table.c.points.desc(), frame.c.frame, table.c.n)
+    )
+    if request.frames:
+        query = query.where(frame.c.frame.in_(request.frames))
+    if request.categories:
+        query = query.where(table.c.category.in_(request.categories))
+    decided = decided_boxes(workspace)
+    found: dict[str, list[ShownBox]] = {}
+    for name, n, category, *box in workspace.database.rows(query):
+        if sum(map(len, found.values())) == request.count:
+            break
+        place = tuple(map(float, box))
+        if (bev_iou(np.array([place]), decided.get(name, empty_boxes())) > SAME_OBJECT_IOU).any():
+            continue
+        shown = ShownBox(FIRST_PROPOSAL_K + int(n), str(category), place, 0.0, 0.0, asked=True)
+        found.setdefault(str(name), []).append(shown)
+    if not found:
+        raise WorkspaceError(
+            f"round {number} has no such proposals to review; run `curate propose --round {number}`"
+        )
+    return found
+
+
+def decided_boxes(workspace: Workspace) -> Mapping[str, np.ndarray]:
+    """Return the boxes that people decided about, by frame."""
+    label, frame = bulk.table("human_label"), bulk.table("frame")
+    query = select(frame.c.frame, *(label.c[name] for name in BOX_COLUMNS)).join(
+        frame, frame.c.id == label.c.frame_id
+    )
+    rows = bulk.grouped(workspace.database.rows(query))
+    return {name: np.array(boxes, dtype=np.float64) for name, boxes in rows.items()}
 
 
 def _human_labels(workspace: Workspace, number: int, policy: str) -> LabelKeys:

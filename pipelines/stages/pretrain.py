@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _LATER_SETTINGS = {  # settings without effect on the first training
     "round_steps", "round_learning_rate", "unlabeled_batch_size", "processes", "threads",
     "start", "loaders", "zero_weight", "teacher", "ema_decay", "command", "labels_format",
-    "statistics_steps",
+    "statistics_steps", "ignore_proposals",
 }  # fmt: skip
 
 

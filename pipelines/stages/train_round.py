@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import Connection
 
 from curate.datasets.base import Dataset
+from curate.detectors.base import IgnoredRegions
 from curate.detectors.devices import AUTO, choose_device
 from curate.detectors.precision import FLOAT32, mixed_precision
 from curate.errors import ConfigError, error_prefix
@@ -18,6 +19,7 @@ from pipelines.assembly import (
     check_labels_format,
     check_policy,
     check_training_options,
+    open_policy,
     trainable_detector,
     trained_detector,
     trainer_command,
@@ -29,6 +31,7 @@ from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.stages import export
 from pipelines.stages.external_trainer import train_externally
 from pipelines.stages.methods import Method, method_of, zero_weight_of
+from pipelines.stages.propose import check_proposable, propose, proposed_regions
 from pipelines.stages.vanished import check_labels
 from pipelines.workspace.config import Config, TrainSection
 from pipelines.workspace.workspace import Workspace, open_dataset
@@ -75,8 +78,12 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
 
 
 def unset_precision(section: TrainSection) -> tuple[str, ...]:
-    """Return the key of `precision` if it is the default: results from before it stay valid."""
-    return ("precision",) if section.precision == FLOAT32 else ()
+    """Return the keys of newer settings with their defaults: results from before stay valid."""
+    unset = {
+        "precision": section.precision == FLOAT32,
+        "ignore_proposals": not section.ignore_proposals,
+    }
+    return tuple(name for name, is_default in unset.items() if is_default)
 
 
 def loaders(section: TrainSection, device: str) -> int:
@@ -110,6 +117,12 @@ def check(workspace: Workspace, policy: str) -> None:
     """
     config = workspace.config
     check_policy(config, policy)
+    if config.train.ignore_proposals:
+        check_proposable(workspace)
+        if config.train.command is not None:
+            raise ConfigError(
+                "train.ignore_proposals is for curate's own trainer; remove it, or train.command"
+            )
     if config.train.command is not None:
         check_labels_format(config, workspace.dataset)
         trainer_command(config.train.command, workspace.root)
@@ -143,7 +156,10 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
             f"detector '{workspace.config.detector.name}' cannot be trained by curate; train it "
             f"yourself on {export.file(workspace, job.context, job.policy)}, or use --command"
         )
-    section = workspace.config.train
+    section, number = workspace.config.train, job.context.number
+    uses_unlabeled = open_policy(workspace.config, job.policy).uses_unlabeled
+    if ignores := section.ignore_proposals and uses_unlabeled:
+        propose(workspace, "unlabeled", number, job.policy, progress)
     report = train_with_progress(
         workspace,
         labels=export.file(workspace, job.context, job.policy),
@@ -158,6 +174,7 @@ def run(workspace: Workspace, job: RoundJob, progress: Progress) -> Product:
         start=job.context.teacher.path if section.start == "teacher" else None,
         frames=section.batch_size + section.unlabeled_batch_size,
         progress=progress,
+        regions=proposed_regions(workspace, number) if ignores else None,
     )
     statistics += report.statistics
     return Product(f"{report.steps} steps, {workspace.relative(path)}", write)
@@ -241,6 +258,7 @@ def train_with_progress(
     start: Path | None,
     frames: int,
     progress: Progress,
+    regions: IgnoredRegions | None = None,
 ) -> "TrainingReport":
     """Train the configured detector, and show the number of steps and the loss as progress.
 
@@ -252,6 +270,7 @@ def train_with_progress(
         start: see there.
         frames: frames per step, at most.
         progress: shows the steps.
+        regions: see `curate.training.trainer.train`.
     """
     from curate.training.trainer import train
     from pipelines.engine.training import plan_training
@@ -274,6 +293,7 @@ def train_with_progress(
             read=FrameReader(config, workspace.dataset),
             progress=show,
             launch=launch,
+            regions=regions,
         )
 
 

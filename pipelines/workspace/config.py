@@ -522,6 +522,11 @@ class TrainSection(Section):
         description="How a student is trained on a label of weight 0. 'method': as the policy "
         "defines; see docs/methods.md.",
     )
+    ignore_proposals: bool = Field(
+        default=False,
+        description="Whether students ignore the places of `curate propose` instead of learning "
+        "them as background; see docs/review.md.",
+    )
     start: Literal["teacher", "scratch"] = Field(
         default="teacher", description="Initial weights of the student of a round."
     )

@@ -40,6 +40,7 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
         "simulate": (root / "data", "--frames", 4),
         "init": (
             work, "--root", data, "--labeled", 0.25, "--detector", detector,
+            "--segmenter", "support.toys:ToySegmenter", "--segmenter-path", results,
             *(word for setting in short for word in ("--set", setting)),
         ),
         "graph": there,
@@ -62,6 +63,9 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
         "view": ("FRAME", *there),
         "report": there,
         "diff": (1, 2, *there),
+        "next": ("--frames", 1, *there),
+        "suspects": ("--split", "val", *there),
+        "propose": there,
         "review export": (review, "--count", 1, *there),
         "review import": (review, "--accept", "all", *there),
         "review list": there,

@@ -10,7 +10,9 @@ import torch
 from curate.datasets.kitti.dataset import KittiDataset
 from curate.errors import DataError, LeakageError
 from curate.frames import Frame
+from curate.training.augmentation import Augmentation
 from curate.training.labels import WeightedLabels
+from curate.training.object_bank import ObjectBank, paste_objects
 
 
 def change(path, statement):
@@ -179,3 +181,29 @@ def test_a_batch_can_have_no_boxes(make_labels):
     batch = labels.collate([labels[0]])
     assert batch.boxes.shape == (0, 7)
     assert len(batch.points) == len(batch.point_frames) > 0
+
+
+def test_regions_to_ignore_are_added_to_unlabeled_frames(make_labels):
+    """Also if weight 0 is background otherwise; regions of other categories are left out."""
+    path = make_labels(labeled=1, unlabeled=2, weight=0.0, zero_weight="background")
+    box = np.array([[10.0, 0, -1, 4, 2, 1.5, 0.3]])
+    regions = {
+        name: (np.repeat(box, 2, axis=0), np.array(["Car", "Tram"]))
+        for name in ("000000", "000001")
+    }
+    labeled, unlabeled, other = WeightedLabels(path, regions=regions)
+    assert not labeled.ignored.any()
+    assert len(labeled.boxes) == len(other.boxes) == 3
+    assert unlabeled.boxes[-1].tolist() == box[0].tolist()
+    assert unlabeled.ignored.tolist() == [False, False, False, True]
+    assert unlabeled.weights.tolist() == [0.0] * 4
+    bank = ObjectBank.build([labeled], ("Car", "Pedestrian", "Cyclist"))
+    pasted = paste_objects(unlabeled, bank, 3, np.random.default_rng(0))
+    assert pasted.ignored.tolist()[:4] == [False, False, False, True]
+    assert not pasted.ignored[4:].any()
+    augmentation = Augmentation(0.0, 0.0, (1.0, 1.0), 0, 1)
+    augmented = augmentation.apply(unlabeled, bank, np.random.default_rng(0))
+    assert augmented.boxes == pytest.approx(box)
+    assert augmented.ignored.tolist() == [True]
+    batch = WeightedLabels(path, regions=regions).collate([unlabeled])
+    assert batch.weights.tolist() == [0.0]
