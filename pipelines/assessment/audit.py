@@ -304,7 +304,7 @@ def _frames(
     complete: Sequence[int],
 ) -> Iterator[AuditedFrame]:
     """Yield the frames with their labels; a frame that is not complete has no labels."""
-    labels = workspace.predictions(context.number, complete)
+    labels = workspace.labels(context.number, complete)
     points = _points(workspace, context.number)
     truth = workspace.ground_truth(split)
     for key, name in frames:

@@ -31,7 +31,7 @@ def label_quality(
         and weighted recall in percent, and AUROC; NaN for a figure that cannot be computed.
     """
     keys = workspace.frames("unlabeled")
-    found = workspace.predictions(round_number, list(keys.values()))
+    found = workspace.labels(round_number, list(keys.values()))
     correct: dict[tuple[int, int], bool] = {}
     objects = 0
     settings = match_settings(workspace.config, "bev")

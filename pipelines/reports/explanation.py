@@ -293,9 +293,11 @@ def _recomputed_rho(config: Config, source: Source, label: dict[str, Any]) -> fl
 
 
 def _opened(config: Config, source: Source, label: dict[str, Any]) -> EvidenceSource:
-    """Return the source for rating one label, with the threshold that is stored with the label."""
+    """Return the source for rating one label, with what is stored with it from X_l."""
     thresholds = {label["category"]: label["points_threshold"] or 1.0}
-    return open_prior(config, source.configured, thresholds, measures=False)
+    reference = label.get("share_reference")
+    references = {} if reference is None else {label["category"]: reference}
+    return open_prior(config, source.configured, thresholds, references=references, measures=False)
 
 
 def _detections(label: dict[str, Any]) -> Detections:
