@@ -48,6 +48,7 @@ _SEGMENT = (
         refusal=segment.refusal,
         prepare=segment.prepare,
         exists=segment.exists,
+        ahead=segment.ahead,
     ),
 )
 _DETECT = (

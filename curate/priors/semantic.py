@@ -281,7 +281,7 @@ def usable_references(found: Mapping[str, ShareReference]) -> dict[str, float]:
             f"no labeled box of {category} is inside an image"
             if quartile is None
             else f"the upper quartile of S/A over {each.boxes} labeled boxes of {category} is only "
-            f"{quartile:.2f}, below {MINIMUM_REFERENCE:g}; check the segmenter's classes"
+            f"{quartile:.3g}, below {MINIMUM_REFERENCE:g}; check the segmenter's classes"
         )
         logger.warning("semantic.reference: %s; S/A of %s is used as it is", reason, category)
     return usable

@@ -196,11 +196,14 @@ class CacheStage(_FramesStage):
         refusal: function that returns a function, which returns why nothing further can be stored;
             "" if it can. The stage then ends early.
         exists: function that returns whether the folder of what it stored is there.
+        ahead: function that returns the splits, besides those of a round, that a later stage reads
+            as a whole.
     """
 
     function: Callable[[Workspace, RoundContext], FrameFunction]
     refusal: Callable[[Workspace], Callable[[], str]]
     exists: Callable[[Workspace], bool]
+    ahead: Callable[[Workspace], Sequence[str]]
 
     @property
     def results(self) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ from typing import Any
 
 from sqlalchemy import select
 
-from curate.errors import ConfigError
 from curate.priors.semantic import SemanticPrior, ShareReference, learn_references
 from db import bulk
 from pipelines.assembly import open_segmenter, segmenter_path
@@ -16,33 +15,14 @@ from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace, sha256, stat_fingerprint
 
 
-def check_reference(workspace: Workspace) -> None:
-    """Check that there are labeled frames if `semantic.reference` needs them.
-
-    Raises:
-        ConfigError: if there are none.
-    """
-    if workspace.config.semantic.reference and not workspace.frames("labeled"):
-        raise ConfigError(
-            "semantic.reference = true compares S/A with labeled boxes, but the workspace has no "
-            "labeled frames; label some, or set semantic.reference = false"
-        )
-
-
 def share_references(workspace: Workspace) -> dict[str, ShareReference]:
-    """Return the reference of each category, from X_l, and store it.
+    """Return the reference of each category, from X_l; they are computed once, and stored.
 
-    The stored ones are returned if segmenter, labeled frames and categories are still the same. The
-    maps of the labeled frames are read from the cache, or made.
+    The maps of the labeled frames are read from the cache, or made.
     """
-    fingerprint = digest(_settings(workspace))
-    table = bulk.table("semantic_reference")
-    columns = (table.c.category, table.c.boxes, table.c.upper_quartile)
-    stored = workspace.database.rows(select(*columns).where(table.c.fingerprint == fingerprint))
-    if stored:
-        found = {category: ShareReference(*values) for category, *values in stored}
-        return {category: found[category] for category in workspace.config.dataset.categories}
-    found = _learn(workspace)
+    if stored := stored_references(workspace):
+        return stored
+    found, fingerprint = _learn(workspace), digest(_settings(workspace))
     rows = [
         {
             "category": category,
@@ -52,10 +32,23 @@ def share_references(workspace: Workspace) -> dict[str, ShareReference]:
         }
         for category, each in found.items()
     ]
+    table = bulk.table("semantic_reference")
     with workspace.database.writing() as connection:
         connection.execute(table.delete())
         bulk.insert_rows(connection, table.name, rows)
     return found
+
+
+def stored_references(workspace: Workspace) -> dict[str, ShareReference]:
+    """Return the stored references; nothing if segmenter, labeled frames or categories changed."""
+    table = bulk.table("semantic_reference")
+    query = select(table.c.category, table.c.boxes, table.c.upper_quartile).where(
+        table.c.fingerprint == digest(_settings(workspace))
+    )
+    return {
+        category: ShareReference(boxes, quartile)
+        for category, boxes, quartile in workspace.database.rows(query)
+    }
 
 
 def settings_of_segmenter(config: Config) -> Mapping[str, Any]:

@@ -44,13 +44,9 @@ from pipelines.engine.stage import (
 from pipelines.labels.sources import Source, prepare_stage, source_of, sources_of
 from pipelines.registry import PRIORS
 from pipelines.stages.reading import FrameReader, ReadsAhead
-from pipelines.stages.references import (
-    check_reference,
-    settings_of_segmenter,
-    share_references,
-)
+from pipelines.stages.references import settings_of_segmenter, share_references
 from pipelines.workspace.config import Config
-from pipelines.workspace.images import check_segmentable
+from pipelines.workspace.images import check_reference, check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset
 
 
@@ -242,7 +238,7 @@ def _check(name: str, workspace: Workspace) -> None:
     if PRIORS.takes(name, "segmenter"):
         check_segmentable(workspace.config, workspace.dataset)
     if PRIORS.takes(name, "references"):
-        check_reference(workspace)
+        check_reference(workspace.config, workspace.frames("labeled"))
     check_prior(workspace.config, name)
 
 
