@@ -21,9 +21,9 @@ MAY_IMPORT = {
 LAYERS = {
     "curate": (
         "shapes", "ranges", "errors", "spelling", "warnings_once", "files", "option_values",
-        "frames", "geometry", "detections", "consistency", "datasets", "category_names",
-        "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
-        "firewall", "viewing", "review", "training", "__main__",
+        "frames", "geometry", "detections", "consistency", "fusion", "datasets",
+        "category_names", "simulation", "segmenters", "priors", "weighting", "evaluation",
+        "exporters", "detectors", "firewall", "viewing", "review", "training", "__main__",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "devices", "assembly", "category_names", "engine",
