@@ -122,7 +122,7 @@ def audit(
         print_json({**header, **as_numbers(found.figures)})
     else:
         _print(found.figures, _title(found), configured_overlaps(opened.config))
-        _print_fusion(found)
+        print_fusion(found)
         print_line("\n".join(summary), indent=2)
         print_line(f"picture: {picture}")
     end(found.reports, as_json=False)
@@ -185,7 +185,7 @@ def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> Non
     )
 
 
-def _print_fusion(found: "AuditedRound") -> None:
+def print_fusion(found: "AuditedRound") -> None:
     """Print the share of correct labels before and after fusion, if boxes are fused."""
     if not found.fusion:
         return

@@ -21,6 +21,7 @@ from curate.geometry.points_in_boxes import count_points_in_boxes
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.assessment.audit import AuditedRound, AuditRequest, run_audit
+from pipelines.commands.audit import print_fusion
 from pipelines.engine.schedule import check_stages
 from pipelines.labels.evidence import read_evidence, read_memory
 from pipelines.labels.of_one_frame import read_frame
@@ -166,16 +167,17 @@ def test_frames_without_a_match_keep_their_labels(views: Workspace) -> None:
 
 
 def test_the_audit_shows_the_share_of_correct_boxes_before_and_after(
-    views: Workspace, curate: Curate
+    views: Workspace, curate: Curate, capsys: pytest.CaptureFixture
 ) -> None:
     """By both overlaps, counted here from the stored boxes; as a table and as JSON."""
     fused = fusing(views)
     found = run_audit(fused, AuditRequest(replicates=20), Silent(), lambda _: None)
     for overlap in ("bev", "3d"):
         check_effect(fused, found, overlap)
-    here = ("audit", "-w", fused.root, "--policy", "score", "--replicates", "10")
-    assert "share of correct labels before and after fusion" in curate(*here)[1]
-    shown = json.loads(curate(*here, "--json")[1])["fusion"]
+    print_fusion(found)
+    assert "share of correct labels before and after fusion" in capsys.readouterr().out
+    here = ("-w", fused.root, "--policy", "score", "--replicates", "10", "--json")
+    shown = json.loads(curate("audit", *here)[1])["fusion"]
     assert [each["category"] for each in shown] == 2 * ["all", *fused.config.dataset.categories]
     assert {"before", "after", "difference"} <= set(shown[0])
 
