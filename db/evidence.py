@@ -107,7 +107,8 @@ def declare(connection: Connection, declaration: Declaration) -> None:
 
     A table of the same name with other columns, or of another class, is replaced by an empty one,
     and the tasks of that source are deleted, so that its evidence is computed again. If only the
-    meaning of a column has been reworded, the evidence stays. The caller recreates the views.
+    meaning of a column has been reworded, the evidence stays; so does that in tables of the schema,
+    which have all their columns from the start. The caller recreates the views.
     """
     former = {each.name: each for each in read_declarations(connection)}.get(declaration.name)
     if former == declaration:
@@ -116,9 +117,8 @@ def declare(connection: Connection, declaration: Declaration) -> None:
     same = former is not None and former.layout == declaration.layout
     if former is not None:
         connection.execute(_RECORD.delete().where(_RECORD.c.name == declaration.name))
-        if not same:
-            if not own:
-                connection.execute(DropTable(evidence_table(former)))
+        if not (same or own):
+            connection.execute(DropTable(evidence_table(former)))
             task = Base.metadata.tables["task"]
             connection.execute(task.delete().where(task.c.stage == former.source))
     if not (same or own):

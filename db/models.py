@@ -244,6 +244,25 @@ class Prediction(Box, Base):
     )
 
 
+class FusedBox(Box, Base):
+    """The box of a label with `repredict.fuse`: mean of the prediction and its repredictions.
+
+    Without fusion the table is empty, and the box of a label is that of its prediction.
+    """
+
+    __tablename__ = "fused_box"
+    __table_args__ = _evidence()
+
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
+    boxes: Mapped[int] = mapped_column(
+        sort_order=1,
+        comment="in the mean; 1 = the prediction alone",
+        doc="number of boxes in the mean; 1 = the prediction alone, because no view matched it",
+    )
+
+
 class RepredictionView(Base):
     """The similarity transform A of one augmented view of a frame."""
 
@@ -349,6 +368,33 @@ class SemanticPrior(Base):
         sort_order=1,
         comment="of several, the one that shows most of the box; null = one camera, or none shows "
         "it",
+    )
+    share_reference: Mapped[float | None] = mapped_column(
+        sort_order=1,
+        comment="by which S/A was divided; null = it was not",
+        doc="upper quartile of S/A over labeled boxes, by which S/A was divided; null = it was not",
+    )
+
+
+class SemanticReference(Base):
+    """Upper quartile of S/A over the labeled boxes of a category, for `semantic.reference`.
+
+    It is not used below 0.15.
+    """
+
+    __tablename__ = "semantic_reference"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    category: Mapped[str] = mapped_column(primary_key=True, doc="category of the boxes")
+    boxes: Mapped[int] = mapped_column(
+        comment="labeled boxes that an image shows", doc="number of labeled boxes in an image"
+    )
+    upper_quartile: Mapped[float | None] = mapped_column(
+        comment="of S/A; null = no such box", doc="upper quartile of their S/A; null = no such box"
+    )
+    fingerprint: Mapped[str] = mapped_column(
+        comment="of all that it depends on",
+        doc="hash of everything that it depends on: labeled frames, segmenter, categories",
     )
 
 

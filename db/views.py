@@ -39,13 +39,18 @@ _EVIDENCE = """
             ON pp.round = w.round AND pp.frame_id = w.frame_id AND pp.k = w.k
         LEFT JOIN semantic_prior AS sp
             ON sp.round = w.round AND sp.frame_id = w.frame_id AND sp.k = w.k
+        LEFT JOIN fused_box AS fb
+            ON fb.round = w.round AND fb.frame_id = w.frame_id AND fb.k = w.k
 """
 _FURTHER = """
         LEFT JOIN {table} AS {alias}
             ON {alias}.round = w.round AND {alias}.frame_id = w.frame_id AND {alias}.k = w.k
 """
-_PREDICTED = """
-               p.k, p.category, p.x, p.y, p.z, p.length, p.width, p.height, p.yaw,
+_BOX = ", ".join(
+    f"CAST(COALESCE(fb.{name}, p.{name}) AS DOUBLE PRECISION) AS {name}" for name in BOX_COLUMNS
+)
+_PREDICTED = f"""
+               p.k, p.category, {_BOX},
                p.score, c.loss, pp.points, pp.points_threshold, pp.rho_diff,
                sp.mask_pixels, sp.box_pixels, sp.rho_anno, w.rho_det, w.lambda_u
 """

@@ -172,7 +172,7 @@ def trainer_command(command: str, root: Path) -> UserCommand:
 def score_meaning(config: Config) -> str | None:
     """Return what a score of the configured detector estimates; None if that is unknown."""
     section = config.detector
-    if section.score_meaning or not _is_detector(config, DescribesScores):
+    if section.score_meaning or not detects_like(config, DescribesScores):
         return section.score_meaning
     trainable = trainable_detector(config)
     preset = trainable.preset if trainable else ""
@@ -193,12 +193,12 @@ def describe_score(meaning: str | None) -> str:
 
 def runs_elsewhere(config: Config) -> bool:
     """Return whether the detector gets copies of files; it needs no path and loads no model."""
-    return _is_detector(config, CopiesDetector)
+    return detects_like(config, CopiesDetector)
 
 
 def batch_size(config: Config) -> int:
     """Return how many frames the configured detector gets at a time."""
-    if not (_is_detector(config, BatchDetector) or runs_elsewhere(config)):
+    if not (detects_like(config, BatchDetector) or runs_elsewhere(config)):
         return 1
     if config.detector.batch_size != "auto":
         return config.detector.batch_size
@@ -208,7 +208,8 @@ def batch_size(config: Config) -> int:
     return preferred
 
 
-def _is_detector(config: Config, protocol: type) -> bool:
+def detects_like(config: Config, protocol: type) -> bool:
+    """Return whether the class of the configured detector implements a protocol of detectors."""
     detector = registry.DETECTORS.load(config.detector.name)
     return isinstance(detector, type) and issubclass(detector, protocol)
 
@@ -594,6 +595,7 @@ def open_prior(
     name: str,
     thresholds: Mapping[str, float],
     *,
+    references: Mapping[str, float] | None = None,
     measures: bool = True,
     segmenter: Segmenter | None = None,
 ) -> EvidenceSource:
@@ -603,6 +605,7 @@ def open_prior(
         config: the configuration.
         name: name of the prior.
         thresholds: points per category, learned from X_l; passed to priors with this argument.
+        references: S/A per category, learned from X_l; passed in the same way.
         measures: whether the prior will read frames; its segmenter is opened only then.
         segmenter: the configured segmenter, if it is open.
     """
@@ -610,6 +613,7 @@ def open_prior(
         name,
         offered={
             "thresholds": lambda: thresholds,
+            "references": lambda: references or {},
             "segmenter": lambda: (segmenter or open_segmenter(config)) if measures else None,
             "settings": lambda: semantic_settings(config),
         },

@@ -10,6 +10,7 @@ from pipelines.engine.rounds import is_pretrained, is_student_trained, open_roun
 from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import (
     export,
+    fuse,
     predict,
     pretrain,
     repredict,
@@ -47,6 +48,7 @@ _SEGMENT = (
         refusal=segment.refusal,
         prepare=segment.prepare,
         exists=segment.exists,
+        ahead=segment.ahead,
     ),
 )
 _DETECT = (
@@ -68,6 +70,18 @@ _DETECT = (
         function=repredict.function,
         check=predict.check,
         ready=check_copies,
+    ),
+)
+_FUSE = (
+    FrameStage(
+        "fuse",
+        command="repredict",
+        reads=("prediction", "reprediction"),
+        writes=("fused_box",),
+        settings=fuse.settings,
+        function=fuse.function,
+        stored=fuse.read_matched,
+        check=fuse.check,
     ),
 )
 _DECIDE = (
@@ -107,7 +121,12 @@ _DECIDE = (
 
 
 def round_graph(
-    priors: Sequence[str] = DEFAULT_PRIORS, *, pretrained: bool = True, maps: bool = True
+    priors: Sequence[str] = DEFAULT_PRIORS,
+    *,
+    pretrained: bool = True,
+    maps: bool = True,
+    fused: bool = False,
+    relative: bool = False,
 ) -> Graph:
     """Return the graph of a round.
 
@@ -115,17 +134,21 @@ def round_graph(
         priors: names of the evidence sources, as in run.priors.
         pretrained: whether curate trains the first teacher, so that the graph starts with pretrain.
         maps: whether the segmenter's maps are stored, so that segment makes them ahead.
+        fused: whether the boxes of labels are fused (`repredict.fuse`).
+        relative: whether S/A is compared with labeled boxes (`semantic.reference`).
 
     Raises:
         ConfigError: if there is no such prior, or its declaration is invalid.
     """
     first: tuple[Stage, ...] = _FIRST if pretrained else ()
     ahead = _SEGMENT if maps and score.reads_maps(priors) else ()
-    scores = score.stages(priors, [each for stage in ahead for each in stage.writes])
+    fusing = _FUSE if fused else ()
+    made, boxes = ([each for one in some for each in one.writes] for some in (ahead, fusing))
+    scores = score.stages(priors, made, boxes, relative=relative)
     evidence = tuple(table for stage in scores for table in stage.writes)
     solve_stage, *others = _DECIDE
-    waiting = replace(solve_stage, reads=(*solve_stage.reads, *evidence))
-    return Graph((*first, *ahead, *_DETECT, *scores, waiting, *others))
+    waiting = replace(solve_stage, reads=(*solve_stage.reads, *boxes, *evidence))
+    return Graph((*first, *ahead, *_DETECT, *fusing, *scores, waiting, *others))
 
 
 def graph_of(workspace: Workspace) -> Graph:
@@ -134,6 +157,8 @@ def graph_of(workspace: Workspace) -> Graph:
         workspace.config.run.priors,
         pretrained=is_pretrained(workspace),
         maps=stores_maps(workspace.config),
+        fused=workspace.config.repredict.fuse,
+        relative=workspace.config.semantic.reference,
     )
 
 

@@ -21,7 +21,7 @@ MAY_IMPORT = {
 LAYERS = {
     "curate": (
         "shapes", "ranges", "errors", "spelling", "warnings_once", "files", "option_values",
-        "frames", "geometry", "detections", "consistency", "tracking", "datasets",
+        "frames", "geometry", "detections", "consistency", "fusion", "tracking", "datasets",
         "category_names", "simulation", "segmenters", "priors", "weighting", "evaluation",
         "exporters", "detectors", "firewall", "viewing", "review", "training", "__main__",
     ),

@@ -40,9 +40,9 @@ def as_numbers(audit: Audit) -> dict[str, Any]:
         "frames": audit.frames,
         "level": audit.level,
         "counts": {"objects": audit.counts.as_dict(), "labels": audit.label_counts.as_dict()},
-        "figures": [_plain(_flat(found)) for found in audit.figures],
+        "figures": [as_plain(_flat(found)) for found in audit.figures],
         "comparisons": [
-            _plain({**asdict(found), "beyond_chance": found.beyond_chance})
+            as_plain({**asdict(found), "beyond_chance": found.beyond_chance})
             for found in audit.comparisons
         ],
     }
@@ -69,12 +69,12 @@ def _flat(found: Figures) -> dict[str, Any]:
     return {**asdict(found), "bins": rows}
 
 
-def _plain(value: Any) -> Any:
+def as_plain(value: Any) -> Any:
     """Convert numpy numbers to Python's, and NaN and infinity to None."""
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: as_plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [as_plain(inner) for inner in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

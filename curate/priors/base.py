@@ -54,8 +54,9 @@ class EvidenceDeclaration(Protocol):
     """All columns that the source stores for a label."""
     rho_column: ClassVar[str | None] = None
     """The column with a prior's trust rho in [0, 1]; rho_det is the product over the priors."""
-    camera_columns: ClassVar[tuple[Column, ...]] = ()
-    """Further columns if frames have several cameras, of sources with a table of the schema."""
+    further_columns: ClassVar[tuple[Column, ...]] = ()
+    """Columns that only some workspaces have, such as those with several cameras; of sources with a
+    table of the schema."""
 
 
 class EvidenceSource(EvidenceDeclaration, Protocol):
@@ -66,7 +67,8 @@ class EvidenceSource(EvidenceDeclaration, Protocol):
 
     The pipeline passes these arguments to a constructor that has parameters with these names:
     `segmenter` (None if nothing will be measured), `thresholds` (points per category, learned from
-    X_l), and the user's options.
+    X_l), `references` (S/A per category, learned from X_l, if `semantic.reference` is true), and
+    the user's options.
     """
 
     measured_columns: ClassVar[tuple[str, ...]]
@@ -188,7 +190,7 @@ def check_evidence(
     """
     columns = [
         *source.columns,
-        *(column for column in source.camera_columns if column.name in evidence),
+        *(column for column in source.further_columns if column.name in evidence),
     ]
     names = [column.name for column in columns]
     for name in (*names, *evidence):

@@ -2,27 +2,39 @@
 
 Source: An et al., Remote Sensing 15(3):627, 2023. Its text says "arithmetic mean" of the score and
 the share of class pixels, but its formula is a square root. The default here is the geometric mean.
+
+Even a perfect box has S/A below 1, because its rectangle contains background, and segmenters miss
+part of small or distant objects. With a reference r(c), the upper quartile of S/A over the labeled
+boxes of category c, the prior uses min(1, (S/A) / r(c)) in place of S/A.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+import logging
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from curate.detections import Detections
+from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, ModelError
 from curate.frames import Frame
 from curate.geometry.projection import camera_of_boxes, image_rectangles
 from curate.priors.base import Column, Evidence, EvidenceSource, Measured
+from curate.ranges import AboveZero
 from curate.segmenters.base import Segmenter, SemanticMap, image_size_of
 from curate.shapes import Float, Int, Num, Shaped
+
+logger = logging.getLogger(__name__)
 
 Mean = Literal["geometric", "product", "arithmetic"]
 Outside = Literal["expected", "neutral", "drop"]
 
 EXPECTED_SHARE = 0.7
 """S/A of a correct label that no camera shows: the median of correct labels on KITTI's frames."""
+REFERENCE_QUANTILE = 0.75
+"""Quantile of S/A over the labeled boxes of a category that is its reference."""
+MINIMUM_REFERENCE = 0.15
+"""A lower reference is not used: the segmenter hardly sees the category, so S/A is mostly noise."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +65,31 @@ _DEFAULT = SemanticSettings()
 
 
 @dataclass(frozen=True)
+class ShareReference:
+    """The reference of a category, from X_l.
+
+    Attributes:
+        boxes: number of labeled boxes of the category that an image shows.
+        upper_quartile: upper quartile of their S/A; None without such a box.
+    """
+
+    boxes: int
+    upper_quartile: float | None
+
+
+@dataclass(frozen=True)
 class SemanticPrior(EvidenceSource):
     """rho_anno = sqrt(s * S / A) with the semantic map of a segmenter.
 
     Attributes:
         segmenter: provides the semantic map; None for a prior that only rates.
         settings: see `SemanticSettings`.
+        references: r(c) per category, in (0, 1]; S/A of other categories is used as it is.
     """
 
     segmenter: Segmenter | None
     settings: SemanticSettings = _DEFAULT
+    references: Mapping[str, AboveZero] = field(default_factory=dict)
     name: ClassVar[str] = "semantic"
     columns: ClassVar[tuple[Column, ...]] = (
         Column("mask_pixels", "int64", "px", "S, pixels of the category in the projected box"),
@@ -70,12 +97,19 @@ class SemanticPrior(EvidenceSource):
         Column("rho_anno", "float64", "1", "semantic prior, Eq. 9, from s, S and A"),
     )
     rho_column: ClassVar[str | None] = "rho_anno"
-    camera_columns: ClassVar[tuple[Column, ...]] = (
+    further_columns: ClassVar[tuple[Column, ...]] = (
         Column(
             "camera",
             "name",
             "",
             "the camera that shows most of the box; null if none shows it",
+            optional=True,
+        ),
+        Column(
+            "share_reference",
+            "float64",
+            "1",
+            "upper quartile of S/A over labeled boxes, by which S/A is divided; null if it is not",
             optional=True,
         ),
     )
@@ -136,10 +170,17 @@ class SemanticPrior(EvidenceSource):
         return count_pixels(rectangles, shown.categories, semantic_map)
 
     def rate(self, detections: Detections, measured: Measured) -> Evidence:
-        """Return S, A and rho_anno (Eq. 9)."""
+        """Return S, A and rho_anno (Eq. 9), and the references if there are any."""
         mask_pixels, box_pixels = measured["mask_pixels"], measured["box_pixels"]
-        rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
-        return {**measured, "rho_anno": rho}
+        names = (*self.measured_columns, "camera")
+        found = {name: measured[name] for name in names if name in measured}
+        if not self.references:
+            rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings)
+            return {**found, "rho_anno": rho}
+        reference = np.array([self.references.get(str(c), np.nan) for c in detections.categories])
+        reference = reference.astype(np.float64)
+        rho = semantic_trust(detections.scores, mask_pixels, box_pixels, self.settings, reference)
+        return {**found, "rho_anno": rho, "share_reference": reference}
 
     def describe(self, row: Mapping[str, Any]) -> str:
         """Return the rule that gave rho_anno, with the numbers of one label."""
@@ -150,11 +191,21 @@ class SemanticPrior(EvidenceSource):
             }[self.settings.outside]  # fmt: skip
             outside = f"no image shows the box, so outside = '{self.settings.outside}' applies"
             return f"{outside}: rho_anno = {rule} with s = {{score}} = {{rho_anno}}".format(**row)
+        reference = self.references.get(row["category"]) if self.references else None
+        share, relative = "S/A", ""
+        if reference is not None:
+            share, seen = "r", row["mask_pixels"] / row["box_pixels"]
+            relative = (
+                f"r = min(1, (S/A) / reference) = min(1, {seen:.4f} / {reference:.4f}) = "
+                f"{min(1.0, seen / reference):.4f}, "
+            )
         formula = {
-            "geometric": "sqrt(s S/A)", "product": "s S/A", "arithmetic": "(s + S/A) / 2",
-        }[self.settings.mean]  # fmt: skip
+            "geometric": f"sqrt(s {share})",
+            "product": f"s {share}",
+            "arithmetic": f"(s + {share}) / 2",
+        }[self.settings.mean]
         numbers = "s = {score}, S = {mask_pixels}, A = {box_pixels} pixels = {rho_anno}"
-        return f"{camera}Eq. 9: rho_anno = {formula} with {numbers}".format(**row)
+        return f"{camera}Eq. 9: rho_anno = {formula} with {relative}{numbers}".format(**row)
 
 
 def semantic_trust(
@@ -162,9 +213,21 @@ def semantic_trust(
     mask_pixels: Num[np.ndarray, " n"],
     box_pixels: Num[np.ndarray, " n"],
     settings: SemanticSettings = _DEFAULT,
+    references: Float[np.ndarray, " n"] | None = None,
 ) -> Float[np.ndarray, " n"]:
-    """Return (n,) rho_anno (Eq. 9) from (n,) scores and (n,) pixel counts S and A."""
+    """Return (n,) rho_anno (Eq. 9).
+
+    Args:
+        scores: (n,) s.
+        mask_pixels: (n,) S.
+        box_pixels: (n,) A; 0 outside the image.
+        settings: see `SemanticSettings`.
+        references: (n,) upper quartiles of S/A over labeled boxes, by which S/A is divided; NaN
+            for labels with an S/A that is used as it is.
+    """
     share = mask_pixels / np.maximum(box_pixels, 1)
+    if references is not None:
+        share = np.where(np.isnan(references), share, np.minimum(share / references, 1.0))
     if settings.mean == "geometric":
         rho = np.sqrt(scores * share)
     elif settings.mean == "product":
@@ -175,6 +238,53 @@ def semantic_trust(
         "expected": EXPECTED_SHARE * scores**2, "neutral": scores, "drop": np.zeros(len(scores)),
     }[settings.outside]  # fmt: skip
     return np.where(box_pixels > 0, rho, outside)
+
+
+def learn_references(
+    samples: Iterable[tuple[Frame, Annotations]], categories: Sequence[str], prior: SemanticPrior
+) -> dict[str, ShareReference]:
+    """Return the reference of each category from labeled frames.
+
+    Boxes that no camera shows do not count.
+
+    Args:
+        samples: frames of X_l, never of X_u, with their ground truth.
+        categories: categories that need a reference.
+        prior: measures S and A.
+    """
+    shares: dict[str, list[np.ndarray]] = {category: [] for category in categories}
+    for frame, annotations in samples:
+        has_box = np.isfinite(annotations.boxes).all(axis=1)
+        chosen = annotations.select(has_box & np.isin(annotations.categories, list(categories)))
+        boxes = Detections(chosen.boxes, np.ones(len(chosen)), chosen.categories)
+        measured = prior.measure(frame, boxes)
+        seen = measured["box_pixels"] > 0
+        share = measured["mask_pixels"][seen] / measured["box_pixels"][seen]
+        for category, of_category in shares.items():
+            of_category.append(share[chosen.categories[seen] == category])
+    merged = {c: np.concatenate([np.zeros(0), *parts]) for c, parts in shares.items()}
+    return {
+        c: ShareReference(len(s), float(np.quantile(s, REFERENCE_QUANTILE)) if len(s) else None)
+        for c, s in merged.items()
+    }
+
+
+def usable_references(found: Mapping[str, ShareReference]) -> dict[str, float]:
+    """Return the references that can be used; warn of the categories without one."""
+    usable = {}
+    for category, each in found.items():
+        quartile = each.upper_quartile
+        if quartile is not None and quartile >= MINIMUM_REFERENCE:
+            usable[category] = quartile
+            continue
+        reason = (
+            f"no labeled box of {category} is inside an image"
+            if quartile is None
+            else f"the upper quartile of S/A over {each.boxes} labeled boxes of {category} is only "
+            f"{quartile:.3g}, below {MINIMUM_REFERENCE:g}; check the segmenter's classes"
+        )
+        logger.warning("semantic.reference: %s; S/A of %s is used as it is", reason, category)
+    return usable
 
 
 def count_pixels(

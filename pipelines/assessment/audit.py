@@ -8,6 +8,7 @@ matched to the ground truth.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from sqlalchemy import select
@@ -18,6 +19,7 @@ from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
 from curate.evaluation.counts import describe_others
 from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
+from curate.evaluation.fusion_effect import FusionEffect, fusion_effects
 from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from db import bulk
@@ -91,6 +93,7 @@ class AuditedRound:
         reports: the reports of the stages.
         unmeasured: the names in the request with weights that could not be measured.
         score_meaning: what a score of the detector estimates; None if unknown.
+        fusion: the effect of fused boxes by both overlaps; empty without `repredict.fuse`.
     """
 
     request: AuditRequest
@@ -99,6 +102,7 @@ class AuditedRound:
     reports: tuple[Report, ...]
     unmeasured: tuple[str, ...] = ()
     score_meaning: str | None = None
+    fusion: tuple[FusionEffect, ...] = ()
 
 
 def run_audit(
@@ -124,10 +128,12 @@ def run_audit(
         reports.append(report)
         on_report(report)
 
-    parts, contexts = [], []
+    parts, contexts, fused = [], [], []
     for plan, split, done in _audited_splits(workspace, request, progress, record):
         failed = _run_stages(plan, split, progress, done)
         parts.append(_evaluate(plan, split, request, failed))
+        if workspace.config.repredict.fuse:
+            fused.append(_before_and_after(plan, split, failed))
         contexts.append(plan.context)
     labels = EvaluatedLabels.joined([part for part, _ in parts])
     weights = {
@@ -142,7 +148,8 @@ def run_audit(
     )
     unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
     meaning = score_meaning(workspace.config)
-    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured, meaning)
+    effects = _fusion_effects(workspace, request, contexts[0], fused)
+    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured, meaning, effects)
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
@@ -247,21 +254,65 @@ def _evaluate(
 ) -> tuple[EvaluatedLabels, dict[str, np.ndarray]]:
     """Return the evaluated labels of a split, and their weights by policy."""
     workspace, context = plan.workspace, plan.context
-    # Sorted by key, like the evidence.
-    frames = sorted(
-        (key, name) for name, key in workspace.frames(split).items() if name not in failed
-    )
-    complete = plan.complete_frames(plan.graph.round_stage("solve"), split)
+    frames, complete = _evaluated_frames(plan, split, failed)
     _, evidence = read_evidence(workspace, context.number, complete)
     repredicted = _is_repredicted(workspace, context.number, complete)
     labels = evaluate_frames(
-        _frames(workspace, context, split, frames, complete),
+        _frames(workspace, context, split, frames, workspace.labels(context.number, complete)),
         match_settings(workspace.config, request.overlap),
     )
     return labels, {
         name: _weights(workspace, name, evidence, context, repredicted=repredicted)
         for name in request.names
     }
+
+
+def _evaluated_frames(
+    plan: Plan, split: str, failed: set[str]
+) -> tuple[list[tuple[int, str]], list[int]]:
+    """Return key and name of all evaluated frames, and the keys of those with labels."""
+    # Sorted by key, like the evidence.
+    frames = sorted(
+        (key, name) for name, key in plan.workspace.frames(split).items() if name not in failed
+    )
+    return frames, plan.complete_frames(plan.graph.round_stage("solve"), split)
+
+
+def _before_and_after(
+    plan: Plan, split: str, failed: set[str]
+) -> Mapping[Overlap, tuple[EvaluatedLabels, EvaluatedLabels]]:
+    """Return, by overlap, the labels with the boxes of the detector and with the fused boxes."""
+    workspace, context = plan.workspace, plan.context
+    frames, complete = _evaluated_frames(plan, split, failed)
+    before, after = (
+        list(_frames(workspace, context, split, frames, read(context.number, complete)))
+        for read in (workspace.predictions, workspace.labels)
+    )
+    return {
+        overlap: (evaluate_frames(before, settings), evaluate_frames(after, settings))
+        for overlap in get_args(Overlap)
+        for settings in [match_settings(workspace.config, overlap)]
+    }
+
+
+def _fusion_effects(
+    workspace: Workspace,
+    request: AuditRequest,
+    context: RoundContext,
+    parts: Sequence[Mapping[Overlap, tuple[EvaluatedLabels, EvaluatedLabels]]],
+) -> tuple[FusionEffect, ...]:
+    """Return the effect of fusion on the labels of all parts; nothing without fusion."""
+    return tuple(
+        effect
+        for overlap in (get_args(Overlap) if parts else ())
+        for effect in fusion_effects(
+            overlap,
+            [part[overlap] for part in parts],
+            workspace.config.dataset.categories,
+            np.random.default_rng([workspace.config.run.seed, context.number]),
+            replicates=request.replicates,
+        )
+    )
 
 
 def _weights(
@@ -301,10 +352,9 @@ def _frames(
     context: RoundContext,
     split: str,
     frames: Sequence[tuple[int, str]],
-    complete: Sequence[int],
+    labels: Mapping[int, Detections],
 ) -> Iterator[AuditedFrame]:
     """Yield the frames with their labels; a frame that is not complete has no labels."""
-    labels = workspace.predictions(context.number, complete)
     points = _points(workspace, context.number)
     truth = workspace.ground_truth(split)
     for key, name in frames:

@@ -39,6 +39,7 @@ from pipelines.stages.labeled_copies import (
 )
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
+from pipelines.workspace.images import check_reference
 from pipelines.workspace.splits import SPLITS
 from pipelines.workspace.workspace import Workspace, read_truth
 
@@ -284,6 +285,7 @@ def _no_views(config: Config) -> Finding:
 
 
 def _segmenter(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
+    check_reference(workspace.config, workspace.frames("labeled"))
     segmenter = open_segmenter(workspace.config)
     return [found for view in frame.views() for found in _map(workspace, segmenter, view)]
 

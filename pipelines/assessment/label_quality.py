@@ -68,7 +68,7 @@ def label_quality(
 def judge_labels(workspace: Workspace, round_number: int) -> JudgedLabels:
     """Compare the labels of a round with the label files of the simulation."""
     keys = workspace.frames("unlabeled")
-    found = workspace.predictions(round_number, list(keys.values()))
+    found = workspace.labels(round_number, list(keys.values()))
     correct: dict[tuple[int, int], bool] = {}
     objects = 0
     settings = match_settings(workspace.config, "bev")

@@ -103,7 +103,7 @@ def work(job: Job, config: Config, sizes: Sizes) -> Mapping[str, int]:
     steps = section.pretrain_steps if first else section.round_steps * config.run.rounds
     passes = 1 if first else (config.run.rounds - 1) * looks_at_unlabeled(job)
     unlabeled = sizes.train - sizes.labeled(job.ratio)
-    graph = round_graph(config.run.priors, maps=stores_maps(config))
+    graph = round_graph(config.run.priors, maps=stores_maps(config), fused=config.repredict.fuse)
     frames = {
         stage.name: unlabeled * (first if isinstance(stage, CacheStage) else passes)
         for stage in graph.frames_stages

@@ -23,7 +23,7 @@ class Metered:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        graph = round_graph(tuple(PRIORS.classes))
+        graph = round_graph(tuple(PRIORS.classes), fused=True)
         self._kinds = {EVALUATE, *(stage.name for stage in graph.frames_stages)}
         self._measured: dict[str, tuple[int, float]] = {}
 

@@ -73,10 +73,11 @@ def audit(
 
     Example: curate audit --policy pspsl --policy threshold --policy score
     """
+    from dataclasses import asdict
     from typing import cast, get_args
 
     from curate.errors import ConfigError
-    from curate.evaluation.audit_summary import as_numbers
+    from curate.evaluation.audit_summary import as_numbers, as_plain
     from curate.evaluation.reliability import Overlap
     from curate.viewing.chart_style import check_format
     from curate.viewing.charts import audit_chart
@@ -116,9 +117,12 @@ def audit(
             "summary": summary,
             "picture": str(picture),
         }
+        if found.fusion:
+            header["fusion"] = as_plain([asdict(each) for each in found.fusion])
         print_json({**header, **as_numbers(found.figures)})
     else:
         _print(found.figures, _title(found), configured_overlaps(opened.config))
+        print_fusion(found)
         print_line("\n".join(summary), indent=2)
         print_line(f"picture: {picture}")
     end(found.reports, as_json=False)
@@ -178,6 +182,26 @@ def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> Non
             if labels
         ],
         title=f"labels by weight of {first.policy}; the other policies are in the table audit_bin",
+    )
+
+
+def print_fusion(found: "AuditedRound") -> None:
+    """Print the share of correct labels before and after fusion, if boxes are fused."""
+    if not found.fusion:
+        return
+    print_line("\n")
+    print_table(
+        ("overlap", "category", "labels", "before", "after", "difference", "interval", ""),
+        [
+            (
+                *(each.overlap, each.category, each.labels),
+                *(_shown(each.before.value), _shown(each.after.value)),
+                *(_shown(each.difference.value), _interval(each.difference)),
+                "" if each.beyond_chance else "may be chance",
+            )
+            for each in found.fusion
+        ],
+        title="share of correct labels before and after fusion (repredict.fuse)",
     )
 
 

@@ -23,6 +23,8 @@ def repredict(
 ) -> None:
     """Run the teacher on augmented copies of frames and compute the consistency loss.
 
+    With repredict.fuse = true, it also fuses the boxes of the labels.
+
     Example: curate repredict
     """
     run_frame_command(

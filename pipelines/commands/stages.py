@@ -27,7 +27,8 @@ def run_frame_command(
     """Run stages of frames on a split.
 
     Args:
-        stages: names of the stages; None for those of the configured priors.
+        stages: names of the stages; None for those of the configured priors. Other stages of the
+            same command run too.
         folder: see `WorkspaceOption`.
         round_number: None for the first round without a student; 0 for stages of no round.
         split: the split of the frames.
@@ -64,7 +65,8 @@ def run_frame_command(
         raise ConfigError(f"--prior {unknown[0]}: not in run.priors {list(priors)}")
     check_executor(workspace.config)
     check_names(workspace)
-    selected = [graph.frames_stage(name) for name in names]
+    commands = {graph.frames_stage(name).command for name in names}
+    selected = [each for each in graph.frames_stages if each.command in commands]
     for stage in selected:
         if stage.check:
             stage.check(workspace)

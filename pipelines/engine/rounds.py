@@ -133,6 +133,15 @@ def _record_round(workspace: Workspace, row: dict[str, Any]) -> None:
         changed = connection.execute(table.update().where(table.c.number == number).values(**row))
         if changed.rowcount == 0:
             connection.execute(table.insert().values(**row))
+        if not workspace.config.repredict.fuse:
+            _delete_fused_boxes(connection, number)
+
+
+def _delete_fused_boxes(connection: Connection, number: int) -> None:
+    """Delete the fused boxes of a round without fusion, so that its labels have no other boxes."""
+    fused, task = bulk.table("fused_box"), bulk.table("task")
+    connection.execute(fused.delete().where(fused.c.round == number))
+    connection.execute(task.delete().where(task.c.round == number, task.c.stage == "fuse"))
 
 
 def stored_round(workspace: Workspace, number: int) -> RoundContext | None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
+from curate.detections import Detections
 from curate.errors import WorkspaceError
 from curate.files.batches import batched
 from db import bulk
@@ -39,10 +40,10 @@ from pipelines.engine.stage import (
     FramesStage,
     FrameStage,
     Product,
-    ReusableMeasurements,
     RoundJob,
     SequenceStage,
     Stage,
+    StoredRows,
 )
 from pipelines.workspace.workspace import Workspace
 
@@ -286,10 +287,12 @@ def _outcomes(
     Frames with reusable measurements are processed last and in this process, without the executor.
     """
     if isinstance(stage, SequenceStage):
-        jobs: Iterator[Part] = _sequence_jobs(plan, plan.waiting_sequences(stage, split))
+        jobs: Iterator[Part] = _sequence_jobs(plan, stage, plan.waiting_sequences(stage, split))
     else:
         frames = plan.waiting_frames(stage, split, measured=False)
-        jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip)
+        stored = stage.stored if isinstance(stage, FrameStage) else None
+        jobs = _frame_jobs(plan, stage, frames, skip, stored)
+        executor = SerialExecutor() if stored else executor
         if isinstance(stage, CacheStage):
             jobs = _until_refused(jobs, stage, plan.workspace)
     # Load the models only if there is a first job.
@@ -299,7 +302,7 @@ def _outcomes(
     if not isinstance(stage, FrameStage) or not stage.reusable:
         return
     frames = plan.waiting_frames(stage, split, measured=True)
-    jobs = _frame_jobs(plan, "prediction" in stage.reads, frames, skip, stage.reusable)
+    jobs = _frame_jobs(plan, stage, frames, skip, stage.reusable.read)
     for first in jobs:
         function = stage.reusable.function(plan.workspace, plan.context)
         yield from SerialExecutor().map(function, chain([first], jobs))
@@ -319,12 +322,12 @@ def _until_refused(
 
 def _frame_jobs(
     plan: Plan,
-    with_predictions: bool,
+    stage: FramesStage,
     frames: Iterable[WaitingFrame],
     skip: Callable[[Sequence[int]], None],
-    reusable: ReusableMeasurements | None = None,
+    stored: StoredRows | None = None,
 ) -> Iterator[FrameJob]:
-    """Yield the jobs of frames, with the predictions and measurements that the stage needs.
+    """Yield the jobs of frames, with the boxes and the stored rows that the stage needs.
 
     Frames that an earlier stage found empty get no job; `skip` records them as empty.
     """
@@ -333,21 +336,29 @@ def _frame_jobs(
         if empty := [frame.key for frame in batch if frame.empty]:
             skip(empty)
         keys = [frame.key for frame in batch if not frame.empty]
-        found = workspace.predictions(context.number, keys) if with_predictions else {}
-        measured = reusable.read(workspace, context, keys) if reusable else {}
+        found = _boxes(plan, stage, keys)
+        measured = stored(workspace, context, keys) if stored else {}
         for frame in batch:
             if not frame.empty:
                 key = frame.key
                 yield FrameJob(key, frame.name, found.get(key), measured.get(key))
 
 
+def _boxes(plan: Plan, stage: FramesStage, keys: Sequence[int]) -> Mapping[int, Detections]:
+    """Return the boxes that a stage reads, by frame key: of predictions, fused ones, or none."""
+    workspace, number = plan.workspace, plan.context.number
+    if "fused_box" in stage.reads:
+        return workspace.labels(number, keys)
+    return workspace.predictions(number, keys) if "prediction" in stage.reads else {}
+
+
 def _sequence_jobs(
-    plan: Plan, sequences: Iterable[tuple[str, list[WaitingFrame]]]
+    plan: Plan, stage: SequenceStage, sequences: Iterable[tuple[str, list[WaitingFrame]]]
 ) -> Iterator[SequenceJob]:
     """Yield the jobs of sequences, with the predictions of each frame; frames may be empty."""
     for name, frames in sequences:
         keys = [frame.key for frame in frames]
-        found = plan.workspace.predictions(plan.context.number, keys)
+        found = _boxes(plan, stage, keys)
         yield SequenceJob(
             name, tuple(FrameJob(frame.key, frame.name, found[frame.key]) for frame in frames)
         )

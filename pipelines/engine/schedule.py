@@ -6,7 +6,7 @@ from pipelines.assembly import check_executor
 from pipelines.engine.graph import Graph
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
-from pipelines.engine.rounds import is_student_trained, open_round
+from pipelines.engine.rounds import is_student_trained, open_round, outside_rounds
 from pipelines.engine.runner import (
     Report,
     check_inputs,
@@ -49,6 +49,10 @@ def run_all(
         yield run_first(workspace, first, progress)
     total = (rounds or workspace.config.run.rounds) if trained else 1
     with open_executor(workspace) as executor:
+        for cache in graph.cache_stages if evidence else ():
+            outside = Plan(workspace, outside_rounds(workspace), graph)
+            for split in cache.ahead(workspace):
+                yield run_frames(outside, cache, executor, progress, split)
         for number in range(1, total + 1):
             plan = Plan(workspace, open_round(workspace, number, rounds), graph)
             if evidence:

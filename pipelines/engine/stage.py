@@ -86,6 +86,10 @@ class Product:
     missing: tuple[str, ...] = ()
 
 
+StoredRows = Callable[[Workspace, RoundContext, Sequence[int]], Mapping[int, Measured]]
+"""A function that returns stored columns of some frames, by frame key."""
+
+
 @dataclass(frozen=True)
 class ReusableMeasurements:
     """How a stage computes its rows from stored measurements, if only the formula has changed.
@@ -99,7 +103,7 @@ class ReusableMeasurements:
 
     reads: tuple[str, ...]
     settings: Callable[[Workspace, RoundContext], Settings]
-    read: Callable[[Workspace, RoundContext, Sequence[int]], Mapping[int, Measured]]
+    read: StoredRows
     function: Callable[[Workspace, RoundContext], FrameFunction]
 
 
@@ -169,10 +173,13 @@ class FrameStage(_FramesStage):
     Attributes:
         function: function that returns what the stage does with a frame, or a batch of frames.
         reusable: how it reuses its stored measurements; None if it has none.
+        stored: function that returns the rows of earlier stages that it works on, besides the
+            predictions. It then runs in this process, because it reads no frame.
     """
 
     function: Callable[[Workspace, RoundContext], FrameFunction | BatchFunction]
     reusable: ReusableMeasurements | None = None
+    stored: StoredRows | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,11 +196,14 @@ class CacheStage(_FramesStage):
         refusal: function that returns a function, which returns why nothing further can be stored;
             "" if it can. The stage then ends early.
         exists: function that returns whether the folder of what it stored is there.
+        ahead: function that returns the splits, besides those of a round, that a later stage reads
+            as a whole.
     """
 
     function: Callable[[Workspace, RoundContext], FrameFunction]
     refusal: Callable[[Workspace], Callable[[], str]]
     exists: Callable[[Workspace], bool]
+    ahead: Callable[[Workspace], Sequence[str]]
 
     @property
     def results(self) -> tuple[str, ...]:

@@ -25,12 +25,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Float, FromClause, Select, and_, select, type_coerce
+from sqlalchemy import ColumnElement, Float, FromClause, Select, and_, select, type_coerce
 
 from curate.detections import Columns, empty_boxes
 from curate.errors import WorkspaceError
 from curate.weighting.base import Evidence, Memory
 from db import bulk
+from db.labels import label_box, with_fused_boxes
 from db.models import BOX_COLUMNS
 from pipelines.labels.sources import prepare_table, rho_columns, sources_of
 from pipelines.workspace.workspace import Workspace
@@ -80,10 +81,8 @@ def read_evidence(
     config = workspace.config
     if "semantic" in config.run.priors and config.semantic.outside == "expected":
         tables["box_pixels"] = "semantic_prior"
-    if boxes:
-        tables |= dict.fromkeys(BOX_COLUMNS, "prediction")
     with workspace.database.reading() as connection:
-        found = bulk.select_columns(connection, _aligned(round_number, tables))
+        found = bulk.select_columns(connection, _aligned(round_number, tables, boxes=boxes))
     inside = np.isin(found["frame_id"], np.asarray(frames, dtype=np.int64))
     if not inside.all():
         found = {name: column[inside] for name, column in found.items()}
@@ -101,25 +100,27 @@ def read_evidence(
     )
 
 
-def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
+def _aligned(round_number: int, tables: Mapping[str, str], *, boxes: bool) -> Select[Any]:
     """Return the query for the predictions of a round with columns of several tables.
 
     Args:
         round_number: number e of the round.
         tables: table of each column; a label without a row in it gets null.
+        boxes: whether to read the boxes of the labels.
     """
     label = bulk.table("prediction")
-    joined: FromClause = label
+    joined: FromClause = with_fused_boxes(label) if boxes else label
     for name in dict.fromkeys(tables.values()):
         table = bulk.table(name)
         if table is not label:
             same = and_(*(table.c[key] == label.c[key] for key in ("round", "frame_id", "k")))
             joined = joined.outerjoin(table, same)
     # As floats, because integers cannot be null in an array.
-    columns = [
+    columns: list[ColumnElement[Any]] = [
         type_coerce(bulk.table(table).c[name], Float()).label(name)
         for name, table in tables.items()
     ]
+    columns += label_box().values() if boxes else ()
     return (
         select(label.c.frame_id, label.c.k, label.c.category, *columns)
         .select_from(joined)
@@ -136,12 +137,10 @@ def read_memory(workspace: Workspace, round_number: int, policy: str) -> Memory:
     """
     weight, prediction = bulk.table("weight"), bulk.table("prediction")
     same = and_(*(weight.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
-    columns = [
-        prediction.c[name] for name in ("frame_id", "category", "score", "iou", *BOX_COLUMNS)
-    ]
+    columns = [prediction.c[name] for name in ("frame_id", "category", "score", "iou")]
     query = (
-        select(*columns, weight.c.v)
-        .select_from(weight.join(prediction, same))
+        select(*columns, *label_box().values(), weight.c.v)
+        .select_from(with_fused_boxes(weight.join(prediction, same)))
         .where(weight.c.round == round_number, weight.c.policy == policy)
         .order_by(prediction.c.frame_id, prediction.c.k)
     )

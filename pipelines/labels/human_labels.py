@@ -12,6 +12,7 @@ from curate.detections import as_categories
 from curate.files.batches import batched
 from curate.review.human_labels import REJECTED, HumanLabels, match_human_labels
 from db import bulk
+from db.labels import label_box, with_fused_boxes
 from db.models import BOX_COLUMNS
 from pipelines.workspace.workspace import Workspace
 
@@ -213,11 +214,11 @@ def _stored(rows: Sequence[bulk.Row]) -> StoredLabels:
 def _predictions(
     connection: Connection, round_number: int, frame_ids: Sequence[int]
 ) -> Mapping[int, list[bulk.Row]]:
-    """Return, by frame key, k, category and box of the predictions of some frames."""
+    """Return, by frame key, k, category and box of the labels of some frames."""
     table = bulk.table("prediction")
-    names = ("frame_id", "k", "category", *BOX_COLUMNS)
     query = (
-        select(*(table.c[name] for name in names))
+        select(table.c.frame_id, table.c.k, table.c.category, *label_box().values())
+        .select_from(with_fused_boxes(table))
         .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
         .order_by(table.c.frame_id, table.c.k)
     )

@@ -115,7 +115,7 @@ def read_frame(workspace: Workspace, name: str, round_number: int, policy: str) 
         DataError: if a weight is not in [0, 1].
     """
     split, key = _find(workspace, name)
-    labels = workspace.predictions(round_number, [key])[key]
+    labels = workspace.labels(round_number, [key])[key]
     weights = _weights(workspace, round_number, (key, name), policy, len(labels))
     truth = None if split == "unlabeled" else workspace.ground_truth(split)[name]
     decided = decided_labels(workspace, round_number, key)

@@ -1,7 +1,7 @@
 """The evidence sources of a workspace: their declarations and their tables."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -21,7 +21,7 @@ from pipelines.workspace.workspace import Workspace
 _log = logging.getLogger(__name__)
 _RESERVED = frozenset(
     {
-        *(column.name for column in (*WEIGHTED_LABELS, *SemanticPrior.camera_columns)),
+        *(column.name for column in (*WEIGHTED_LABELS, *SemanticPrior.further_columns)),
         *("probability", "frame_id"),
     }
 )
@@ -37,14 +37,14 @@ class Source:
         declaration: its name and its columns.
         measured_columns: names of the columns that it measures; empty for a source of sequences.
         of_sequences: whether it processes whole sequences, not single frames.
-        camera_columns: further columns if frames have several cameras.
+        further_columns: columns that only some workspaces have.
     """
 
     configured: str
     declaration: Declaration
     measured_columns: tuple[str, ...]
     of_sequences: bool
-    camera_columns: tuple[Column, ...] = ()
+    further_columns: tuple[Column, ...] = ()
 
     @property
     def table(self) -> str:
@@ -76,7 +76,7 @@ def source_of(configured: str) -> Source:
         )
     declaration = Declaration(kind.name, configured, tuple(kind.columns), kind.rho_column)
     measured = () if of_sequences else tuple(kind.measured_columns)
-    further = tuple(kind.camera_columns) if configured in OWN_TABLES else ()
+    further = tuple(kind.further_columns) if configured in OWN_TABLES else ()
     return Source(configured, declaration, measured, of_sequences, further)
 
 
@@ -130,12 +130,27 @@ def check_sequences(config: Config, dataset: Dataset) -> None:
 def prepare_stage(workspace: Workspace, source: Source) -> None:
     """Prepare the table of a source before its stage runs, see `prepare_table`.
 
-    With several cameras, the column of the semantic prior's camera is declared too.
+    Columns that only some workspaces have are declared when they are first used, and stay declared:
+    they have values in the rounds before.
     """
     prepare_table(workspace, source)
-    if source.camera_columns and _has_cameras(workspace):
-        further = replace(source.declaration, columns=source.camera_columns, rho_column=None)
-        _declare(workspace, further)
+    if not source.further_columns:
+        return
+    with workspace.database.reading() as connection:
+        stored = read_declarations(connection)
+    declared = {
+        column.name
+        for each in stored
+        if each.name == source.declaration.name
+        for column in each.columns
+    }
+    used = tuple(
+        column
+        for column in source.further_columns
+        if column.name in declared or _USED[column.name](workspace)
+    )
+    if used:
+        _declare(workspace, replace(source.declaration, columns=used, rho_column=None))
 
 
 def _has_cameras(workspace: Workspace) -> bool:
@@ -147,6 +162,12 @@ def _has_cameras(workspace: Workspace) -> bool:
     images = dataset.files(first).images
     # A damaged image must fail its own frame, not the stage: only the paths are looked at.
     return len(images or dataset.read(first, points=False).cameras) > 1
+
+
+_USED: Mapping[str, Callable[[Workspace], bool]] = {
+    "camera": _has_cameras,
+    "share_reference": lambda workspace: workspace.config.semantic.reference,
+}
 
 
 def prepare_table(workspace: Workspace, source: Source) -> None:
@@ -179,7 +200,7 @@ def _declare(workspace: Workspace, declaration: Declaration) -> None:
         drop_views(connection)
         declare(connection, declaration)
         create_views(connection)
-    if any(
+    if declaration.name not in OWN_TABLES and any(
         other.name == declaration.name and other.layout != declaration.layout for other in stored
     ):
         _log.warning(

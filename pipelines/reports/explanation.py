@@ -141,6 +141,7 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     lines = _lines(config, label, views, age, evidence, recomputed, limit)
     meaning = workspace.config.detector.score_meaning or score_meaning(config)
     lines.insert(1, f"  score          {describe_score(meaning)}")
+    lines[3:3] = _fusion_lines(workspace, label)
     recomputed = recomputed if limit is None else limit
     return Explanation(label, views, age, evidence, recomputed, tuple(lines))
 
@@ -293,9 +294,11 @@ def _recomputed_rho(config: Config, source: Source, label: dict[str, Any]) -> fl
 
 
 def _opened(config: Config, source: Source, label: dict[str, Any]) -> EvidenceSource:
-    """Return the source for rating one label, with the threshold that is stored with the label."""
+    """Return the source for rating one label, with what is stored with it from X_l."""
     thresholds = {label["category"]: label["points_threshold"] or 1.0}
-    return open_prior(config, source.configured, thresholds, measures=False)
+    reference = label.get("share_reference")
+    references = {} if reference is None else {label["category"]: reference}
+    return open_prior(config, source.configured, thresholds, references=references, measures=False)
 
 
 def _detections(label: dict[str, Any]) -> Detections:
@@ -421,10 +424,39 @@ def _head(number: dict[str, Any]) -> list[str]:
     """Return the lines that identify the label and its box."""
     return [
         "round {round}, frame {frame}, label {k}: {category}, score {score}".format(**number),
-        "  box            x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(
-            **number
-        ),
+        f"  box            {_box_text(number)}",
     ]
+
+
+def _fusion_lines(workspace: Workspace, label: dict[str, Any]) -> list[str]:
+    """Return the lines with the detector's box of a label with a fused box; none for others."""
+    fused, frame, prediction = map(bulk.table, ("fused_box", "frame", "prediction"))
+    same = and_(*(fused.c[key] == prediction.c[key] for key in ("round", "frame_id", "k")))
+    query = (
+        select(fused.c.boxes, *(prediction.c[name] for name in BOX_COLUMNS))
+        .select_from(fused.join(prediction, same).join(frame, frame.c.id == fused.c.frame_id))
+        .where(
+            fused.c.round == label["round"],
+            frame.c.frame == label["frame"],
+            fused.c.k == label["k"],
+        )
+    )
+    found = workspace.database.rows(query)
+    if not found:
+        return []
+    boxes, *box = found[0]
+    if boxes == 1:
+        return ["  fused          no view matched: the box is that of the detector"]
+    mean = f"mean of {boxes} boxes, weighted by s^2: the detector's and those of {boxes - 1} views"
+    return [
+        f"  fused          {mean}; L below is that of the detector's box",
+        f"  detector's box {_box_text(_numbers(dict(zip(BOX_COLUMNS, box, strict=True))))}",
+    ]
+
+
+def _box_text(number: Mapping[str, Any]) -> str:
+    """Return a box as text."""
+    return "x {x}  y {y}  z {z}  l {length}  w {width}  h {height}  yaw {yaw}".format(**number)
 
 
 def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str) -> str:

@@ -13,6 +13,7 @@ from curate.priors.base import Column
 from curate.viewing.canvas import jpeg
 from db import bulk
 from db.evidence import OWN_TABLES, evidence_table, label_columns, read_declarations
+from db.labels import label_box, with_fused_boxes
 from db.models import BOX_COLUMNS
 from pipelines.labels.human_labels import DecidedLabels, decided_labels
 from pipelines.labels.of_one_frame import chosen_round
@@ -157,8 +158,8 @@ class FramePages:
             column.name for column in label_columns(declared) if _is_evidence(column, tables)
         ]
         names = ("k", "category", "x", "y", "score", *evidence, "rho_det", "lambda_u", "v")
-        joined: Any = prediction
-        columns = {**prediction.c}
+        joined: Any = with_fused_boxes(prediction)
+        columns = {**prediction.c, **label_box()}
         for table in (*tables, weight):
             same_label = [
                 table.c[name] == prediction.c[name] for name in ("round", "frame_id", "k")

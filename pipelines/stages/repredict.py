@@ -160,7 +160,7 @@ class Repredict(Predict):
 
 def settings(workspace: Workspace, context: RoundContext) -> Settings:
     """Return what repredictions depend on besides predictions and teacher."""
-    section = workspace.config.repredict.model_dump(mode="json")
+    section = workspace.config.repredict.model_dump(mode="json", exclude={"fuse"})
     folder = copies_folder(workspace.config, context.number, context.split)
     copies = {} if folder is None else {"copies": copies_fingerprint(folder)}
     return {**section, **copies, "seed": context.seed, "round": context.number}

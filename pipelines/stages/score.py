@@ -6,9 +6,8 @@ the frame.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,21 @@ from sqlalchemy import select
 from curate.datasets.base import pose_of, time_of
 from curate.errors import DataError, WorkspaceError
 from curate.frames import Frame
-from curate.priors.base import Evidence, Measured, SequenceFrame, check_evidence
+from curate.priors.base import (
+    Evidence,
+    EvidenceSource,
+    Measured,
+    SequenceFrame,
+    check_evidence,
+)
 from curate.priors.points import learn_thresholds
+from curate.priors.semantic import usable_references
 from db import bulk
 from pipelines.assembly import (
     check_prior,
     open_prior,
     open_sequence_source,
     point_settings,
-    segmenter_path,
 )
 from pipelines.devices import segmenter_place
 from pipelines.engine.executors.base import FrameJob, FrameRows, SequenceJob
@@ -45,11 +50,11 @@ from pipelines.labels.sources import (
     sources_of,
 )
 from pipelines.registry import PRIORS
-from pipelines.stages.predict import settings_of_results
 from pipelines.stages.reading import FrameReader, ReadsAhead
+from pipelines.stages.references import settings_of_segmenter, share_references
 from pipelines.workspace.config import Config
-from pipelines.workspace.images import check_segmentable
-from pipelines.workspace.workspace import Workspace, open_dataset, sha256, stat_fingerprint
+from pipelines.workspace.images import check_reference, check_segmentable
+from pipelines.workspace.workspace import Workspace, open_dataset
 
 
 @dataclass
@@ -60,11 +65,13 @@ class Score(ReadsAhead):
         config: the configuration.
         source: name of the source in run.priors.
         thresholds: points per category, learned from X_l, for sources with this argument.
+        references: S/A per category, learned from X_l, for sources with this argument.
     """
 
     config: Config
     source: str
     thresholds: Mapping[str, float]
+    references: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         place = segmenter_place(self.config) if PRIORS.takes(self.source, "segmenter") else None
@@ -74,7 +81,16 @@ class Score(ReadsAhead):
         """Open the data set, the source and its models."""
         self.dataset = open_dataset(self.config)
         self.read = FrameReader(self._read)
-        self.prior = open_prior(self.config, self.source, self.thresholds)
+        self.prior = self._opened(measures=True)
+
+    def _opened(self, *, measures: bool) -> EvidenceSource:
+        return open_prior(
+            self.config,
+            self.source,
+            self.thresholds,
+            references=self.references,
+            measures=measures,
+        )
 
     def _read(self, frame_id: str) -> Frame:
         """Return what the source needs of a frame."""
@@ -102,7 +118,7 @@ class Rescore(Score):
 
     def open(self) -> None:
         """Open the source alone, without data set and segmenter."""
-        self.prior = open_prior(self.config, self.source, self.thresholds, measures=False)
+        self.prior = self._opened(measures=False)
 
     def __call__(self, job: FrameJob) -> FrameRows:
         """Return the rows of the source's table."""
@@ -159,36 +175,45 @@ class ScoreSequence:
         ]
 
 
-def stage(source: Source, maps: Sequence[str] = ()) -> FramesStage:
+def stage(
+    source: Source,
+    maps: Sequence[str] = (),
+    boxes: Sequence[str] = (),
+    *,
+    relative: bool = False,
+) -> FramesStage:
     """Return the stage of a source.
 
     Args:
         source: the source.
         maps: what a source with a segmenter reads besides: the stored maps, if there are any.
+        boxes: the tables that replace the boxes of predictions, if there are any.
+        relative: whether S/A is compared with labeled boxes (`semantic.reference`).
     """
     name = source.configured
     if source.of_sequences:
         return SequenceStage(
             name,
             command=f"score --prior {name}",
-            reads=("frame", "prediction"),
+            reads=("frame", "prediction", *boxes),
             writes=(source.table,),
             settings=partial(_sequence_settings, source),
             function=lambda workspace, _context: ScoreSequence(workspace.config, name),
             check=partial(_check, name),
             prepare=partial(prepare_stage, source=source),
         )
-    learns = ("ground_truth",) if PRIORS.takes(name, "thresholds") else ()
+    learned = PRIORS.takes(name, "thresholds") or (relative and PRIORS.takes(name, "references"))
+    learns = ("ground_truth",) if learned else ()
     shown = tuple(maps) if PRIORS.takes(name, "segmenter") else ()
     return FrameStage(
         name,
         command=f"score --prior {name}",
-        reads=("frame", *learns, *shown, "prediction"),
+        reads=("frame", *learns, *shown, "prediction", *boxes),
         writes=(source.table,),
         settings=partial(_settings, source),
         function=partial(_function, Score, name),
         reusable=ReusableMeasurements(
-            reads=("frame", "prediction"),
+            reads=("frame", "prediction", *boxes),
             settings=partial(_measured_settings, source),
             read=partial(_read_measured, source),
             function=partial(_function, Rescore, name),
@@ -198,17 +223,25 @@ def stage(source: Source, maps: Sequence[str] = ()) -> FramesStage:
     )
 
 
-def stages(names: Sequence[str], maps: Sequence[str] = ()) -> tuple[FramesStage, ...]:
+def stages(
+    names: Sequence[str],
+    maps: Sequence[str] = (),
+    boxes: Sequence[str] = (),
+    *,
+    relative: bool = False,
+) -> tuple[FramesStage, ...]:
     """Return the stages of several sources.
 
     Args:
         names: names of the sources.
         maps: see `stage`.
+        boxes: see `stage`.
+        relative: see `stage`.
 
     Raises:
         ConfigError: if one is unknown or invalid, or two share a name or a column.
     """
-    return tuple(stage(source, maps) for source in sources_of(names))
+    return tuple(stage(source, maps, boxes, relative=relative) for source in sources_of(names))
 
 
 def reads_maps(names: Sequence[str]) -> bool:
@@ -219,6 +252,8 @@ def reads_maps(names: Sequence[str]) -> bool:
 def _check(name: str, workspace: Workspace) -> None:
     if PRIORS.takes(name, "segmenter"):
         check_segmentable(workspace.config, workspace.dataset)
+    if PRIORS.takes(name, "references"):
+        check_reference(workspace.config, workspace.frames("labeled"))
     check_prior(workspace.config, name)
     check_sequences(workspace.config, workspace.dataset)
 
@@ -234,11 +269,12 @@ def _settings(source: Source, workspace: Workspace, _context: RoundContext) -> S
     """Return the settings of the formula, which rho depends on besides the measurements."""
     name = source.configured
     sections = {"thresholds": workspace.config.points, "settings": workspace.config.semantic}
+    # Without a reference, the evidence is what it was before there was this setting.
     return {
-        argument: section.model_dump(mode="json")
+        argument: section.model_dump(mode="json", exclude={"reference"})
         for argument, section in sections.items()
         if PRIORS.takes(name, argument)
-    }
+    } | ({"reference": True} if _is_relative(workspace, name) else {})
 
 
 def _sequence_settings(source: Source, workspace: Workspace, _context: RoundContext) -> Settings:
@@ -266,22 +302,21 @@ def _measured_settings(source: Source, workspace: Workspace, _context: RoundCont
     options = {"options": config.run.prior_options.get(name, {}), **_declared(source)}
     if not PRIORS.takes(name, "segmenter"):
         return options
-    path = segmenter_path(config)
-    segmenter = settings_of_results(config.segmenter)
-    return {**options, "segmenter": segmenter, "model": _identity(path)}
-
-
-def _identity(path: Path | None) -> str:
-    """Return a fingerprint of a model file, or of a folder of saved maps."""
-    if path is not None and path.is_dir():
-        return stat_fingerprint(path)
-    return sha256(path) if path is not None and path.is_file() else str(path)
+    return {**options, **settings_of_segmenter(config)}
 
 
 def _function(kind: type[Score], name: str, workspace: Workspace, _context: RoundContext) -> Score:
     """Return what score does with a frame; X_l is read here, once for all workers."""
     thresholds = _learned(workspace) if PRIORS.takes(name, "thresholds") else {}
-    return kind(workspace.config, name, thresholds)
+    references = {}
+    if _is_relative(workspace, name):
+        references = usable_references(share_references(workspace))
+    return kind(workspace.config, name, thresholds, references)
+
+
+def _is_relative(workspace: Workspace, name: str) -> bool:
+    """Return whether a source compares S/A with labeled boxes."""
+    return workspace.config.semantic.reference and PRIORS.takes(name, "references")
 
 
 def _learned(workspace: Workspace) -> Mapping[str, float]:
@@ -299,7 +334,7 @@ def _read_measured(
 ) -> Mapping[int, Measured]:
     """Return the measured columns of some frames by frame key, each in the order of k."""
     table = bulk.table(source.table)
-    names = (*source.measured_columns, *(each.name for each in source.camera_columns))
+    names = (*source.measured_columns, *(each.name for each in source.further_columns))
     query = (
         select(table.c.frame_id, *(table.c[column] for column in names))
         .where(table.c.round == context.number, table.c.frame_id.in_(frame_ids))

@@ -22,6 +22,7 @@ from pipelines.devices import segmenter_place
 from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.stage import RoundContext
 from pipelines.stages.reading import FrameReader, ReadsAhead
+from pipelines.stages.references import stored_references
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_segmentable
 from pipelines.workspace.workspace import Workspace, open_dataset
@@ -63,6 +64,12 @@ def settings(workspace: Workspace, _context: RoundContext) -> dict[str, Any]:
 def exists(workspace: Workspace) -> bool:
     """Return whether the folder of the maps is there."""
     return open_map_store(workspace.config).exists()
+
+
+def ahead(workspace: Workspace) -> tuple[str, ...]:
+    """Return the labeled frames if their maps are needed for `semantic.reference`."""
+    needed = workspace.config.semantic.reference and not stored_references(workspace)
+    return ("labeled",) if needed else ()
 
 
 def prepare(workspace: Workspace) -> None:

@@ -383,6 +383,12 @@ class RepredictSection(Section):
         description="A prediction and a reprediction match only above this BEV IoU.",
         json_schema_extra=_unit("1"),
     )
+    fuse: bool = Field(
+        default=False,
+        description="Whether the mean of a prediction and its matched repredictions, weighted by "
+        "the squared scores, replaces the box of the label. Use 3 views or more; audit shows the "
+        "share of correct boxes before and after.",
+    )
 
 
 class PointsSection(Section):
@@ -421,6 +427,11 @@ class SemanticSection(Section):
         default="expected",
         description="Trust rho_anno of a box that no camera shows: 'expected' is 0.7 s^2, and such "
         "a label never outweighs the best label with image evidence; 'neutral' is s; 'drop' is 0.",
+    )
+    reference: bool = Field(
+        default=False,
+        description="Whether S/A is divided by, and capped at, its upper quartile over the labeled "
+        "boxes of the category. A quartile below 0.15 is not used.",
     )
 
 

@@ -1,7 +1,7 @@
 """The images of a data set, and what follows for the settings if there are none."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from curate.datasets.base import Dataset, Incomplete
 from curate.errors import ConfigError, DataError
@@ -93,3 +93,20 @@ def report_images(config: Config, dataset: Dataset, frames: Sequence[str]) -> No
             "(detector.camera_view), set image_size, see docs/datasets.md"
         )
     _log.warning("%s: no images and no image_size: %s%s", config.dataset.root, pictures, crop)
+
+
+def check_reference(config: Config, labeled: Collection[str]) -> None:
+    """Check that there are labeled frames if `semantic.reference` compares labels with them.
+
+    Args:
+        config: the configuration.
+        labeled: names of the labeled frames.
+
+    Raises:
+        ConfigError: if there are none.
+    """
+    if config.semantic.reference and "semantic" in config.run.priors and not labeled:
+        raise ConfigError(
+            "semantic.reference = true compares S/A with labeled boxes, but there are no labeled "
+            "frames; label some, or set semantic.reference = false"
+        )

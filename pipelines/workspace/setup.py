@@ -27,6 +27,7 @@ from db import bulk
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from pipelines import registry
 from pipelines.workspace.config import Config
+from pipelines.workspace.images import check_reference
 from pipelines.workspace.samples import check_samples
 from pipelines.workspace.split_record import split_rows
 from pipelines.workspace.splits import SPLITS
@@ -78,6 +79,7 @@ def initialise(
     check_files(config)
     dataset = open_dataset(config)
     split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
+    check_reference(config, split.labeled)
     check_samples(dataset, sorted((*split.labeled, *split.unlabeled, *split.val)))
     truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
     if compare:

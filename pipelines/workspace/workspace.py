@@ -1,14 +1,14 @@
 """A workspace: the folder with the configuration, the database and the results of a project."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import FromClause, select
 
 from curate.category_names import renamed
 from curate.datasets.base import Dataset
@@ -18,6 +18,7 @@ from curate.datasets.kitti.labels import DONT_CARE
 from curate.detections import Annotations, Detections
 from curate.errors import ConfigError, WorkspaceError
 from db import bulk
+from db.labels import label_box, with_fused_boxes
 from db.models import BOX_COLUMNS, RECTANGLE_COLUMNS
 from db.session import Database
 from pipelines import registry
@@ -122,14 +123,27 @@ class Workspace:
     def predictions(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
         """Return the stored predictions of some frames, by frame key, in the order of k."""
         table = bulk.table("prediction")
+        return self._detections(table, dict(table.c), round_number, frame_ids)
+
+    def labels(self, round_number: int, frame_ids: Sequence[int]) -> dict[int, Detections]:
+        """Return the labels: the predictions, with their fused boxes where there are any."""
+        table = bulk.table("prediction")
+        return self._detections(with_fused_boxes(table), label_box(), round_number, frame_ids)
+
+    def _detections(
+        self, tables: FromClause, box: Mapping[str, Any], number: int, frame_ids: Sequence[int]
+    ) -> dict[int, Detections]:
+        table = bulk.table("prediction")
         query = (
             select(
                 table.c.frame_id,
                 table.c.category,
                 table.c.score,
-                *(table.c[name] for name in (*BOX_COLUMNS, "iou")),
+                *(box[name] for name in BOX_COLUMNS),
+                table.c.iou,
             )
-            .where(table.c.round == round_number, table.c.frame_id.in_(frame_ids))
+            .select_from(tables)
+            .where(table.c.round == number, table.c.frame_id.in_(frame_ids))
             .order_by(table.c.frame_id, table.c.k)
         )
         found = bulk.grouped(self.database.rows(query), frame_ids)

@@ -86,7 +86,7 @@ def test_a_declaration_matches_its_table(name: str) -> None:
     is_builtin = declaration.table in Base.metadata.tables
     table = Base.metadata.tables[declaration.table] if is_builtin else evidence_table(declaration)
     own = [column.name for column in table.columns if column.name not in KEY]
-    assert own == [column.name for column in (*prior.columns, *prior.camera_columns)]
+    assert own == [column.name for column in (*prior.columns, *prior.further_columns)]
     assert all(column.meaning for column in prior.columns)
     assert prior.name == name
 

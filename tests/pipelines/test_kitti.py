@@ -78,3 +78,47 @@ def test_frames_without_labels_are_read_too(
     [row] = json.loads(curate("query", sql, "--json", "-w", work)[1])
     assert row["n"] > 100
     assert row["best"] > 0.9
+
+
+def test_real_labels_are_fused_and_compared_with_labeled_boxes(
+    curate: Curate, tmp_path: Path, real_frames: Path, kitti_root: Path
+) -> None:
+    """Fused boxes and references on real frames: what is stored explains every weight.
+
+    The detector finds cars only, so one reference applies to all labels.
+    """
+    work = tmp_path / "work"
+    (tmp_path / "labeled.txt").write_text("000000\n000004\n")
+    code, _, err = curate(
+        "init", work, "--root", real_frames, "--follow-links",
+        "--labeled", tmp_path / "labeled.txt",
+        "--detector", "recorded", "--detector-path", kitti_root / "recorded" / "pointgnn_T0.csv",
+        "--segmenter", "onnx", "--segmenter-classes", "voc", "--segmenter-path",
+        kitti_root / "segmenter" / "deeplabv3_mnv2_pascal_quant.onnx",
+        "--set", "repredict.fuse=true", "--set", "semantic.reference=true",
+    )  # fmt: skip
+    assert code == 0, err
+    code, _, err = curate("run", "-w", work)
+    assert code == 0, err
+    sql = (
+        "SELECT w.*, p.x AS detected_x, f.boxes, c.matched_views FROM weighted_labels w "
+        "JOIN frame USING (frame) JOIN prediction p ON p.frame_id = frame.id AND p.k = w.k "
+        "JOIN fused_box f ON f.frame_id = frame.id AND f.k = w.k "
+        "JOIN consistency c ON c.frame_id = frame.id AND c.k = w.k"
+    )
+    rows = json.loads(curate("query", sql, "--json", "--limit", "999", "-w", work)[1])
+    assert len(rows) > 30
+    for row in rows:
+        assert row["boxes"] == 1 + row["matched_views"]
+        assert (row["x"] != row["detected_x"]) is (row["boxes"] > 1)
+        assert abs(row["x"] - row["detected_x"]) < 2
+    [reference] = {row["share_reference"] for row in rows}
+    assert 0.15 < reference <= 1
+    for row in rows:
+        if row["box_pixels"]:
+            share = min(1, row["mask_pixels"] / row["box_pixels"] / reference)
+            assert row["rho_anno"] == pytest.approx((row["score"] * share) ** 0.5)
+    best = max(rows, key=lambda row: row["weight"])
+    out = curate("explain", best["frame"], str(best["k"]), "-w", work)[1]
+    assert "mean of 2 boxes" in out
+    assert "they differ" not in out

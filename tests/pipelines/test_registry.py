@@ -42,7 +42,7 @@ def test_a_class_without_the_required_members_is_rejected(
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(
-        ConfigError, match=r"^prior '.*' has no columns, rho_column, camera_columns; see"
+        ConfigError, match=r"^prior '.*' has no columns, rho_column, further_columns; see"
     ):
         PRIORS.load("priors_of_a_user:Mine")
 

@@ -8,15 +8,18 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from oracles import pixels
 
-from curate.detections import Detections, as_categories
+from curate.detections import Annotations, Detections, as_categories
 from curate.errors import ConfigError, ModelError
 from curate.frames import Calibration, Camera, Frame
 from curate.priors.base import check_evidence
 from curate.priors.semantic import (
     SemanticPrior,
     SemanticSettings,
+    ShareReference,
     count_pixels,
+    learn_references,
     semantic_trust,
+    usable_references,
 )
 from curate.segmenters.base import SemanticMap
 
@@ -275,3 +278,102 @@ def test_a_label_that_no_camera_shows_is_worth_less_than_a_confirmed_one(score, 
     unseen, seen = semantic_trust(scores, np.array([0, mask]), np.array([0, area]))
     assert 0 <= unseen <= 0.7
     assert unseen <= seen or mask / area < 0.7
+
+
+def truth(boxes, categories):
+    """Return ground truth with these boxes."""
+    count = len(boxes)
+    return Annotations(
+        np.reshape(np.array(boxes, dtype=np.float64), (count, 7)), as_categories(categories),
+        np.zeros(count), np.zeros(count, np.int64), np.zeros(count), np.zeros((count, 4)),
+    )  # fmt: skip
+
+
+def striped(columns):
+    """Return a frame's map: cars in the first columns of the car ahead's rectangle, 31 to 49."""
+    class_ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+    class_ids[:, 31 : 31 + columns] = 7
+    return class_ids
+
+
+def test_a_reference_is_the_upper_quartile_of_labeled_boxes_in_the_image():
+    """S/A of 2, 6, 10 and 14 of 19 columns; boxes behind, without a box or of a van are left out.
+
+    The upper quartile of four values lies a quarter of the way from the third to the fourth: 11/19.
+    """
+    nothing = [np.nan] * 7
+    boxes = truth([AHEAD, BEHIND, nothing, AHEAD], ["Car", "Car", "Car", "Van"])
+    for columns in (6, 14, 2, 10):
+        prior = SemanticPrior(Painted(striped(columns)))
+        each = learn_references([(frame(), boxes)], ("Car", "Pedestrian"), prior)
+        assert each["Car"] == ShareReference(1, pytest.approx(columns / 19))
+
+    class Frames:
+        """A segmenter with a map for each frame in turn."""
+
+        needs_image = False
+
+        def __init__(self):
+            self.maps = [striped(columns) for columns in (6, 14, 2, 10)]
+
+        def segment(self, _frame):
+            return SemanticMap(self.maps.pop(), CLASSES)
+
+    four = learn_references([(frame(), boxes)] * 4, ("Car", "Pedestrian"), SemanticPrior(Frames()))
+    assert four["Car"] == ShareReference(4, pytest.approx(11 / 19))
+    assert four["Pedestrian"] == ShareReference(0, None)
+
+
+def test_each_camera_counts_its_own_boxes():
+    """The box behind is seen by the camera that looks back."""
+    back = striped(19)
+    segmenter = PaintedByCamera({"front": striped(0), "back": back}, [])
+    boxes = truth([AHEAD, BEHIND], ["Car", "Car"])
+    found = learn_references([(several(), boxes)], ("Car",), SemanticPrior(segmenter))
+    behind = SemanticPrior(segmenter).measure(several(), labels([BEHIND], [1.0]))
+    share = behind["mask_pixels"][0] / behind["box_pixels"][0]
+    assert found["Car"] == ShareReference(2, pytest.approx(0.75 * share))
+
+
+@pytest.mark.parametrize(
+    ("mean", "rho"),
+    [("geometric", np.sqrt(0.81 * 0.5)), ("product", 0.405), ("arithmetic", 0.655)],
+)
+def test_a_share_is_divided_by_its_reference_and_capped(mean, rho):
+    """5 of 20 pixels against 0.5, then 18 of 20, a category without reference, and no pixels."""
+    prior = SemanticPrior(None, SemanticSettings(mean=mean), {"Car": 0.5})
+    names = ["Car", "Car", "Pedestrian", "Car"]
+    measured = {
+        "mask_pixels": np.array([5, 18, 5, 0]), "box_pixels": np.array([20, 20, 20, 0]),
+    }  # fmt: skip
+    found = prior.rate(labels([AHEAD] * 4, [0.81] * 4, names), measured)
+    plain = SemanticPrior(None, SemanticSettings(mean=mean)).rate(
+        labels([AHEAD] * 4, [0.81] * 4, names), measured
+    )
+    assert found["rho_anno"][0] == pytest.approx(rho)
+    assert found["rho_anno"][1] == pytest.approx(
+        {"geometric": 0.9, "product": 0.81, "arithmetic": 0.905}[mean]
+    )
+    np.testing.assert_array_equal(found["rho_anno"][2:], plain["rho_anno"][2:])
+    np.testing.assert_array_equal(found["share_reference"], [0.5, 0.5, np.nan, 0.5])
+    assert "share_reference" not in plain
+    check_evidence(prior, found, 4)
+    row = {"category": "Car", "score": "0.8100", "mask_pixels": 5, "box_pixels": 20,
+           "rho_anno": f"{rho:.4f}"}  # fmt: skip
+    text = prior.describe(row)
+    assert "r = min(1, (S/A) / reference) = min(1, 0.2500 / 0.5000) = 0.5000" in text
+    assert text.endswith(f"A = 20 pixels = {rho:.4f}")
+    assert "reference" not in prior.describe(row | {"category": "Pedestrian"})
+
+
+def test_a_low_reference_is_not_used(caplog):
+    """Nor a missing one; one line says which categories are left as they are, and why."""
+    found = {
+        "Car": ShareReference(7, 0.15),
+        "Pedestrian": ShareReference(3, 0.149),
+        "Cyclist": ShareReference(0, None),
+    }
+    assert usable_references(found) == {"Car": 0.15}
+    low, missing = caplog.messages
+    assert "over 3 labeled boxes of Pedestrian is only 0.149, below 0.15" in low
+    assert "no labeled box of Cyclist is inside an image; S/A of Cyclist is used as" in missing
