@@ -85,7 +85,8 @@ def p_values(
     units = len(np.unique(unit_index))
     labels_per_unit = len(probability) / units
     rank = _rank_in_unit(probability, unit_index)
-    return np.minimum((above + rank) / ((held_out.units + 1) * labels_per_unit), 1.0)
+    p = (above + rank) / ((held_out.units + 1) * labels_per_unit)
+    return np.asarray(np.minimum(p, 1.0))
 
 
 def benjamini_hochberg(p: Float[np.ndarray, " m"], max_wrong: float) -> Bool[np.ndarray, " m"]:

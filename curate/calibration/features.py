@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from curate.errors import ConfigError, DataError
-from curate.shapes import Bool, Float, Shaped
+from curate.shapes import Float, Shaped
 
 MATCHED = "matched"
 _SCORE_RANGE = (1e-4, 1.0 - 1e-4)
@@ -156,12 +156,12 @@ def mean_log_sizes(
         category: category of each object of X_l.
         boxes: their boxes; those with a size of 0 are left out.
     """
-    valid: Bool[np.ndarray, " n"] = (boxes[:, 3:6] > 0).all(axis=1)
-    logs = {
-        str(name): np.log(boxes[valid & (category == name), 3:6]).mean(axis=0)
-        for name in np.unique(category[valid])
-    }
-    return {name: (float(l), float(w), float(h)) for name, (l, w, h) in logs.items()}
+    valid = (boxes[:, 3:6] > 0).all(axis=1)
+    sizes = {}
+    for name in np.unique(category[valid]).tolist():
+        length, width, height = np.log(boxes[valid & (category == name), 3:6]).mean(axis=0).tolist()
+        sizes[name] = (length, width, height)
+    return sizes
 
 
 def _size_deviation(

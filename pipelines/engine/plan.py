@@ -55,7 +55,7 @@ from sqlalchemy import (
 )
 
 from curate.datasets.base import sequences_of
-from curate.errors import WorkspaceError
+from curate.errors import ConfigError, WorkspaceError
 from curate.firewall.sequences import group_by_sequence
 from db import bulk
 from pipelines.assembly import open_policy
@@ -359,7 +359,7 @@ class Plan:
             return "waiting"
         try:
             job = self.job(stage, policy)
-        except WorkspaceError:
+        except (ConfigError, WorkspaceError):
             return "stale"
         current = self.round_fingerprint(stage, job)
         file = stage.file(self.workspace, self.context, policy) if stage.file else None

@@ -104,6 +104,8 @@ def _round_rows(plan: Plan, stage: RoundStage) -> Iterator[tuple[Any, ...]]:
     )
     policies = {row[0] for row in workspace.database.rows(query)}
     for policy in sorted(policies | {workspace.config.run.method}):
+        if not stage.is_part(workspace, policy):
+            continue
         state = plan.round_state(stage, policy)
         done = int(state == "done")
         yield (context.number, stage.name, "", policy, state, done, 0, 0, 1 - done)

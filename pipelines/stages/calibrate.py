@@ -188,7 +188,9 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """Fit the calibration of the round, and keep labels that it has not used for max_wrong."""
     config, source = workspace.config, choose_source(workspace, job.context.number)
     parts = [_read(each, config) for each in job.truth]
-    labels = [part for part, each in zip(parts, job.truth, strict=True) if _is_for_fit(source, each)]
+    labels = [
+        part for part, each in zip(parts, job.truth, strict=True) if _is_for_fit(source, each)
+    ]
     fitted, held_out = _Labels.joined(labels), _Labels.joined(parts[len(labels) :])
     unseen = _unseen(workspace)
     if source != SET_ASIDE and unseen is not None:
@@ -332,7 +334,9 @@ def _out_of_sample(workspace: Workspace, labels: _Labels) -> dict[str, float]:
     probability = np.full(len(part), np.nan)
     try:
         for each in range(_PARTS):
-            rest = [f for f, u in zip(labels.frames, labels.unit, strict=True) if part_of[u] != each]
+            rest = [
+                f for f, u in zip(labels.frames, labels.unit, strict=True) if part_of[u] != each
+            ]
             fit = _fit(workspace, labels.of_frames(rest))
             inside = part == each
             probability[inside] = fit.probability(labels.evidence.select(inside))
@@ -370,7 +374,9 @@ def _writer(job: RoundJob, row: dict[str, Any], held_out: Sequence[dict[str, Any
         others = (task.round == number, task.stage == "calibrate", task.variant != job.policy)
         connection.execute(bulk.table("task").delete().where(*others))
         bulk.insert_rows(connection, "calibration", [empty | row])
-        bulk.insert_rows(connection, "calibration_label", [{"round": number, **r} for r in held_out])
+        bulk.insert_rows(
+            connection, "calibration_label", [{"round": number, **r} for r in held_out]
+        )
 
     return write
 
