@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import expit
 
 from curate.calibration.features import LabelEvidence, feature_names, features
 from curate.errors import CurateError, DataError
@@ -80,7 +79,8 @@ class Calibration:
         Raises:
             ConfigError: if the calibration was fitted to other evidence or categories.
         """
-        return np.asarray(expit(self.intercept + self.terms(evidence).sum(axis=1)))
+        logit = self.intercept + self.terms(evidence).sum(axis=1)
+        return np.asarray(np.exp(-np.logaddexp(0.0, -logit)))
 
     def as_json(self) -> str:
         """Return the calibration as a JSON object, from which `from_json` restores it exactly."""

@@ -11,7 +11,6 @@ covariance of p and ln p under the weights.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from curate.shapes import Float
 
@@ -64,6 +63,9 @@ def sharpen(probability: Float[np.ndarray, " n"], precision: float) -> Sharpenin
         limit = 1e6
     else:
         limit = max(1.0, float(np.log(LEAST_MAXIMUM) / np.log(greatest)))
+    # scipy takes long to import, and explanations of other weights do not need it.
+    from scipy.optimize import brentq
+
     if reached(1.0) >= precision:
         gamma = 1.0
     elif reached(limit) <= precision:

@@ -17,7 +17,7 @@ from curate.errors import ConfigError
 from curate.evaluation.kitti_rules import relaxed
 from curate.evaluation.reliability import auroc, expected_calibration_error
 from db import bulk
-from pipelines.assembly import open_policy
+from pipelines.assembly import check_policy, open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
 from pipelines.labels.calibration import needs_calibration
@@ -40,7 +40,12 @@ Row = dict[str, Any]
 
 
 def applies(workspace: Workspace, policy: str) -> bool:
-    """Return whether a policy reads probabilities."""
+    """Return whether a policy reads probabilities.
+
+    Raises:
+        ConfigError: if the policy cannot be created with its settings.
+    """
+    check_policy(workspace.config, policy)
     return needs_calibration(open_policy(workspace.config, policy))
 
 
