@@ -125,7 +125,7 @@ class SplitList(Base):
 
 
 class GroundTruth(Base):
-    """The annotated objects of labeled, val and calibration frames.
+    """The annotated objects of labeled and val frames, and of those set aside for calibration.
 
     The foreign key includes the frame's split, so the database rejects a row of an unlabeled frame.
     """
