@@ -44,7 +44,7 @@ def test_extreme_values_are_limited():
     assert found["loss"] == pytest.approx(-np.log(0.02))
     assert (found["points"], found["rho_diff"]) == (0, pytest.approx(np.log(1e-3)))
     assert of(label(score=0.0, loss=1e9))["loss"] == pytest.approx(-np.log(20))
-    flat = label(boxes=[0, 0, 0, 0, 0, 0, 0])
+    flat = label(boxes=[0.0] * 7)
     assert all(map(np.isfinite, of(flat).values()))
 
 
