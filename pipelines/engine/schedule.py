@@ -16,7 +16,7 @@ from pipelines.engine.runner import (
     run_round,
 )
 from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
-from pipelines.engine.truth import run_truth
+from pipelines.engine.truth import check_truth_inputs, run_truth
 from pipelines.workspace.workspace import Workspace
 
 
@@ -54,6 +54,7 @@ def run_all(
             plan = Plan(workspace, open_round(workspace, number, rounds), graph)
             if evidence:
                 check_inputs(plan, graph.stages)
+                check_truth_inputs(plan, policy)
             for stage in graph.stages:
                 if isinstance(stage, FramesStage) and evidence:
                     yield run_frames(plan, stage, executor, progress)

@@ -3,9 +3,11 @@
 They are made by the same stages as those of unlabeled frames, right before the round stage.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
+from curate.errors import WorkspaceError
 from pipelines.engine.executors.base import Executor
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
@@ -26,6 +28,27 @@ def run_truth(
         for source in stage.truth(plan.workspace, plan.context, policy, create=True):
             for report in _run_source(plan, source, executor, progress):
                 yield replace(report, stage=f"{report.stage} {source.title}")
+
+
+def check_truth_inputs(plan: Plan, policy: str) -> None:
+    """Check the input of the stages that make these labels, before any stage of the round runs.
+
+    Folds that do not exist yet are checked when they are created.
+
+    Raises:
+        CurateError: if it is missing or wrong.
+    """
+    for stage in plan.graph.stages:
+        if not isinstance(stage, RoundStage) or stage.truth is None:
+            continue
+        if not stage.is_part(plan.workspace, policy):
+            continue
+        sources: Sequence[TruthSource] = ()
+        with suppress(WorkspaceError):
+            sources = stage.truth(plan.workspace, plan.context, policy, create=False)
+        for source in sources:
+            if source.workspace is plan.workspace:
+                check_inputs(plan.of_source(source), plan.graph.frames_stages, source.split)
 
 
 def _run_source(
