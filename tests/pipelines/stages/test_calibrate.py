@@ -120,6 +120,23 @@ def test_a_changed_threshold_repeats_the_fit_and_what_follows(data: Path, tmp_pa
     assert state_of(changed, "calibrate", "learned") == "stale"
 
 
+def test_an_interrupted_fit_resumes_with_the_labels_that_are_there(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames are not predicted again, and nothing of the fit is stored before it is complete."""
+    workspace = make(data, tmp_path)
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipelines.stages.calibrate.fit_calibration", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_workspace(workspace, train=False)
+    assert stored(workspace) == []
+    assert done(workspace) == ["calibrate", "solve", "export"]
+
+
 def test_policies_that_read_no_probability_have_no_such_stage(
     data: Path, tmp_path: Path, curate: Curate
 ) -> None:
