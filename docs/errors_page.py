@@ -54,11 +54,14 @@ def errors_page(root: Path, note: str) -> str:
 
 
 def error_classes() -> list[type[CurateError]]:
-    """Return the root and all of its subclasses, by exit code."""
+    """Return the root and all of its subclasses, by exit code and name.
+
+    Their order of definition depends on what was imported first.
+    """
     found = [CurateError]
     for kind in found:
         found += kind.__subclasses__()
-    return sorted(found, key=lambda kind: kind.exit_code)
+    return sorted(found, key=lambda kind: (kind.exit_code, kind is not found[0], kind.__name__))
 
 
 def messages_of(root: Path, classes: set[str]) -> dict[str, set[Message]]:

@@ -9,6 +9,8 @@ from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import is_pretrained, is_student_trained, open_round
 from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import (
+    calibrate,
+    calibration_frames,
     export,
     fuse,
     predict,
@@ -84,16 +86,30 @@ _FUSE = (
         check=fuse.check,
     ),
 )
-_DECIDE = (
+_JUDGE = (
+    RoundStage(
+        "calibrate",
+        command="calibrate",
+        reads=("ground_truth", "prediction", "consistency"),
+        writes=("calibration",),
+        settings=calibrate.settings,
+        run=calibrate.run,
+        applies=calibrate.applies,
+        truth=calibration_frames.truth,
+        check_truth=calibration_frames.check_truth,
+    ),
     RoundStage(
         "solve",
         command="solve",
-        reads=("prediction", "consistency"),
+        reads=("prediction", "consistency", "calibration"),
         writes=("weight",),
         settings=solve.settings,
         run=solve.run,
         check=solve.check,
+        needs=("calibrate",),
     ),
+)
+_TRAIN = (
     RoundStage(
         "export",
         command="export",
@@ -146,9 +162,8 @@ def round_graph(
     made, boxes = ([each for one in some for each in one.writes] for some in (ahead, fusing))
     scores = score.stages(priors, made, boxes, relative=relative)
     evidence = tuple(table for stage in scores for table in stage.writes)
-    solve_stage, *others = _DECIDE
-    waiting = replace(solve_stage, reads=(*solve_stage.reads, *boxes, *evidence))
-    return Graph((*first, *ahead, *_DETECT, *fusing, *scores, waiting, *others))
+    judging = (replace(stage, reads=(*stage.reads, *boxes, *evidence)) for stage in _JUDGE)
+    return Graph((*first, *ahead, *_DETECT, *fusing, *scores, *judging, *_TRAIN))
 
 
 def graph_of(workspace: Workspace) -> Graph:
@@ -163,10 +178,16 @@ def graph_of(workspace: Workspace) -> Graph:
 
 
 def run_graph(workspace: Workspace) -> Graph:
-    """Return the stages that a run of a workspace includes: none that trains, without a trainer."""
-    trained = is_student_trained(workspace)
-    stages = graph_of(workspace).stages
-    return Graph(tuple(each for each in stages if trained or "student" not in each.writes))
+    """Return the stages that a run of a workspace includes, with its trainer and its method."""
+    trained, method = is_student_trained(workspace), workspace.config.run.method
+    return Graph(
+        tuple(
+            stage
+            for stage in graph_of(workspace).stages
+            if (trained or "student" not in stage.writes)
+            and (not isinstance(stage, RoundStage) or stage.is_part(workspace, method))
+        )
+    )
 
 
 def open_plan(

@@ -24,15 +24,15 @@ from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from db import bulk
 from pipelines.assembly import check_executor, describe_score, open_policy, score_meaning
-from pipelines.assessment.audit_folds import open_folds
-from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
 from pipelines.labels.evidence import read_evidence
+from pipelines.labels.matching import match_settings, rectangles_in_image
 from pipelines.round import graph_of, open_plan
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.workspace import Workspace
 
 POLICIES = ("pspsl", "spsl", "threshold", "uniform")

@@ -30,8 +30,15 @@ from pipelines.assembly import (
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.devices import detector_place, idle_gpu, segmenter_place
-from pipelines.engine.rounds import choose_round, is_trainable, newest_checkpoint
+from pipelines.engine.rounds import (
+    choose_round,
+    is_student_trained,
+    is_trainable,
+    newest_checkpoint,
+)
 from pipelines.labels.of_one_frame import find_frame
+from pipelines.stages import calibrate
+from pipelines.stages.calibration_frames import check_truth, choose_source
 from pipelines.stages.labeled_copies import (
     TURNED,
     examine_labeled_copies,
@@ -40,7 +47,7 @@ from pipelines.stages.labeled_copies import (
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
 from pipelines.workspace.images import check_reference
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import HELD_OUT, SPLITS, WITH_TRUTH
 from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
@@ -61,7 +68,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     Raises:
         ConfigError: if no frame of the workspace has that name, or several have.
     """
-    names = list(workspace.frames("unlabeled", "val", "labeled"))
+    names = list(workspace.frames(*SPLITS))
     unlabeled = list(workspace.frames("unlabeled"))
     if not names:
         raise ConfigError(f"doctor: the workspace {workspace.root} has no frames")
@@ -77,6 +84,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
+    findings += _guarded("calibration", lambda: _calibration(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     return name, findings
@@ -87,7 +95,7 @@ def report_wrong_inputs(workspace: Workspace) -> None:
 
     The detector is left out: results are compared when they are opened, and models take time.
     """
-    name = next(iter(workspace.frames("unlabeled", "val", "labeled")), None)
+    name = next(iter(workspace.frames(*SPLITS)), None)
     if name is None:
         return
     semantic = "semantic" in workspace.config.run.priors
@@ -96,6 +104,7 @@ def report_wrong_inputs(workspace: Workspace) -> None:
     except CurateError:
         return  # the frames that cannot be read are reported by their own check
     findings = [*_guarded("labels", lambda: _labels(workspace, frame))]
+    findings += _guarded("calibration", lambda: _calibration(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     for finding in findings:
@@ -124,6 +133,22 @@ def _training(config: Config) -> Sequence[Finding]:
     return []
 
 
+def _calibration(workspace: Workspace) -> Sequence[Finding]:
+    """Check that the method has frames to learn probabilities from, if it reads any."""
+    method = workspace.config.run.method
+    if not calibrate.applies(workspace, method):
+        return []
+    number, rounds = choose_round(workspace, None, None)
+    last = rounds if is_student_trained(workspace) else number
+    check_truth(workspace, method, range(number, last + 1))
+    source = choose_source(workspace, number)
+    frames = len(workspace.frames("labeled" if source == "folds" else source))
+    of = (
+        f"{source} of {frames} labeled frames" if source == "folds" else f"{frames} {source} frames"
+    )
+    return [Finding("calibration", "ok", f"probabilities are learned from {of}")]
+
+
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:
     """Return the findings of a check, or its error as a finding."""
     try:
@@ -134,8 +159,8 @@ def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Find
 
 def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     """Check the labels of some labeled frames, with those of the frame itself if it has any."""
-    others = [name for name in workspace.frames("labeled", "val") if name != frame.frame_id]
-    own = len(others) < len(workspace.frames("labeled", "val"))
+    others = [name for name in workspace.frames(*WITH_TRUTH) if name != frame.frame_id]
+    own = len(others) < len(workspace.frames(*WITH_TRUTH))
     dataset = workspace.dataset
     frames = [frame] if own else []
     frames += [dataset.read(name) for name in others[: _LABELED_FRAMES - len(frames)]]
@@ -235,7 +260,7 @@ def _other_results(
 ) -> list[tuple[Frame, Detections]]:
     """Return some more frames with recorded results, which cost nothing to compute."""
     found: list[tuple[Frame, Detections]] = []
-    names = (name for name in workspace.frames("unlabeled", "val") if name != frame.frame_id)
+    names = (name for name in workspace.frames("unlabeled", *HELD_OUT) if name != frame.frame_id)
     if not isinstance(detector, RecordedDetector):
         return found
     for name in itertools.islice(names, _RESULT_FRAMES):
@@ -250,7 +275,7 @@ def _other_results(
 
 def _headings(workspace: Workspace, detector: Detector) -> list[Finding]:
     """Compare recorded results of labeled and val frames with the ground truth."""
-    names = list(workspace.frames("labeled", "val"))
+    names = list(workspace.frames(*WITH_TRUTH))
     if not isinstance(detector, RecordedDetector):
         return []
     recorded = sorted({*names} - {*detector.missing_frames(names)})[:_LABELED_FRAMES]

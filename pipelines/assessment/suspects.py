@@ -29,12 +29,12 @@ from curate.viewing.canvas import save_png
 from curate.viewing.close_up import CloseUpLabel, draw_close_up
 from db.models import BOX_COLUMNS
 from pipelines.assembly import check_executor, open_segmenter
-from pipelines.assessment.audit_folds import open_folds
-from pipelines.assessment.evaluation import rectangles_in_image
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable, recorded_config
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
+from pipelines.labels.matching import rectangles_in_image
 from pipelines.round import graph_of, open_plan
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.workspace import Workspace
 
 _log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from curate.segmenters.classes import CLASS_MAPS
 from pipelines.commands.options import JsonOption, complete, one_of, registered
 from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS, detector_and_preset
 from pipelines.reports.terminal import print_json, print_line
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import SPLITS, count_frames
 
 
 def init(
@@ -36,6 +36,13 @@ def init(
         str,
         typer.Option(help="The same for validation frames; default: the val list of the data set."),
     ] = "",
+    calibration: Annotated[
+        str,
+        typer.Option(
+            help="Share of the validation frames to set aside for `curate calibrate`, or a file "
+            "with their ids."
+        ),
+    ] = "",
     split_by: Annotated[
         str,
         typer.Option(
@@ -60,6 +67,13 @@ def init(
     detector_path: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="Checkpoint, model file or results of an external detector."),
+    ] = None,
+    unseen: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Labeled frames that an external detector was not trained on, for `curate "
+            "calibrate`: a file with their ids, or 'labeled' for all."
+        ),
     ] = None,
     detector_config: Annotated[
         Optional[Path],  # noqa: UP045
@@ -125,6 +139,7 @@ def init(
         "detector": {
             "name": detector,
             "path": detector_path and detector_path.resolve(),
+            "unseen": _unseen(unseen),
             "options": _model_file(detector, detector_path, detector_config),
         },
         "segmenter": {
@@ -147,24 +162,34 @@ def init(
         check_labels_format(config, frames)
     config = fit_priors(config, frames, explicit=chosen)
     check_sequences(config, frames)
-    workspace = initialise(directory, config, labeled, val)
+    workspace = initialise(directory, config, labeled, val, calibration)
     report_missing_results(workspace, supplied)
     report_wrong_inputs(workspace)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
-    counts = {split: len(workspace.frames(split)) for split in SPLITS}
+    counts = count_frames({split: workspace.frames(split) for split in SPLITS})
     objects = stored_names(workspace)
     if as_json:
         print_json({"workspace": str(workspace.root), "frames": counts, "objects": objects})
         return
-    print_line(
-        f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
-        f"{counts['val']} val frames; settings in curate.toml"
-    )
+    *first, last = (f"{count} {split}" for split, count in counts.items())
+    print_line(f"{workspace.root}: {', '.join(first)} and {last} frames; settings in curate.toml")
     used = {name: count for name, count in objects.items() if name in config.dataset.categories}
     others = {name: count for name, count in objects.items() if name not in used}
     if objects:
         tail = f"; not in dataset.categories: {listed(others)}" if others else ""
         print_line(f"objects in the label files: {listed(used)}{tail}")
+
+
+def _unseen(text: str | None) -> Path | str | None:
+    """Return the value of --unseen: the word, or the path of a file."""
+    from curate.errors import ConfigError
+
+    if text in {None, "labeled"}:
+        return text
+    path = Path(str(text))
+    if not path.is_file():
+        raise ConfigError(f"--unseen {text}: no such file; give a file of frame ids, or labeled")
+    return path.resolve()
 
 
 def _model_file(detector: str, path: Path | None, config: Path | None) -> dict[str, str]:

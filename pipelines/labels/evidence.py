@@ -82,7 +82,7 @@ def read_evidence(
     if "semantic" in config.run.priors and config.semantic.outside == "expected":
         tables["box_pixels"] = "semantic_prior"
     with workspace.database.reading() as connection:
-        found = bulk.select_columns(connection, _aligned(round_number, tables, boxes=boxes))
+        found = bulk.select_columns(connection, aligned_query(round_number, tables, boxes=boxes))
     inside = np.isin(found["frame_id"], np.asarray(frames, dtype=np.int64))
     if not inside.all():
         found = {name: column[inside] for name, column in found.items()}
@@ -100,7 +100,7 @@ def read_evidence(
     )
 
 
-def _aligned(round_number: int, tables: Mapping[str, str], *, boxes: bool) -> Select[Any]:
+def aligned_query(round_number: int, tables: Mapping[str, str], *, boxes: bool) -> Select[Any]:
     """Return the query for the predictions of a round with columns of several tables.
 
     Args:

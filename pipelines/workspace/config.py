@@ -224,6 +224,12 @@ class DetectorSection(Section):
         "frames; a relative path starts at the workspace.",
         examples=["copies/{round}-{split}"],
     )
+    unseen: Path | Literal["labeled"] | None = Field(
+        default=None,
+        description="Labeled frames that your own detector has not been trained on, for `curate "
+        "calibrate`: a file with their ids, or 'labeled' for all of them.",
+        examples=["labeled"],
+    )
     device: Annotated[str, KnownDevice()] = Field(
         default="auto",
         description="Where the detector runs and trains: 'cpu', or a device of torch such as "
@@ -435,6 +441,53 @@ class SemanticSection(Section):
     )
 
 
+class CalibrateSection(Section):
+    """How the probability that a label is correct is learned from frames with ground truth.
+
+    Policies such as learned need it. The teacher must not have been trained on the frames.
+    """
+
+    source: Literal["auto", "calibration", "labeled", "folds"] = Field(
+        default="auto",
+        description="Frames to learn from: those set aside with `curate init --calibration`; "
+        "labeled frames that your detector has not seen (detector.unseen); or folds of the labeled "
+        "frames, each with a teacher trained on the others. 'auto' takes the first that is "
+        "possible.",
+    )
+    folds: Annotated[int, Field(ge=2)] = Field(
+        default=5,
+        description="Number of folds, each with a training.",
+        json_schema_extra=_unit("folds"),
+    )
+    overlap: Literal["bev", "3d"] = Field(
+        default="bev", description="Overlap with an object that makes a label correct."
+    )
+    thresholds: Literal["kitti", "relaxed"] = Field(
+        default="kitti",
+        description="IoU that it must exceed: those of evaluation.overlaps (0.7 for Car, 0.5 for "
+        "others), or relaxed ones (0.5 and 0.25).",
+    )
+
+
+class LearnedSection(Section):
+    """The policy learned, which weights a label by the probability that it is correct."""
+
+    precision: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.8,
+        description="Requested weighted precision: the share of the weight that is on correct "
+        "labels.",
+        json_schema_extra=_unit("1"),
+    )
+    max_wrong: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        default=None,
+        description="Largest expected share of wrong labels among the selected ones. With it, "
+        "selected labels have weight 1 and others 0, and precision is not used. It needs frames "
+        "that are set aside for calibration.",
+        json_schema_extra=_unit("1"),
+        examples=[0.1],
+    )
+
+
 class SolveSection(Section):
     """How policies weight the labels. run.method selects the policy."""
 
@@ -453,6 +506,9 @@ class SolveSection(Section):
         default=True,
         description="Whether pspsl uses the factor 1 - L / lambda. With false, the weight is the "
         "product of the priors, and no repredictions are needed.",
+    )
+    learned: LearnedSection = Field(
+        default=LearnedSection(), description="Settings of the policy learned."
     )
     options: dict[PolicyName, Options] = Field(
         default={},
@@ -662,6 +718,7 @@ class Config(Section):
     repredict: RepredictSection = RepredictSection()
     points: PointsSection = PointsSection()
     semantic: SemanticSection = SemanticSection()
+    calibrate: CalibrateSection = CalibrateSection()
     solve: SolveSection = SolveSection()
     train: TrainSection = TrainSection()
     run: RunSection = RunSection()

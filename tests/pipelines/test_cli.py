@@ -198,7 +198,9 @@ def test_a_policy_option_of_another_type_gives_a_one_line_error(curate: Curate, 
     """The option, its value and what it should be, without a traceback."""
     path = made / "curate.toml"
     options = 'options = {threshold = {threshold = "high"}}'
-    path.write_text(path.read_text().replace("options = {}\n\n[train]", f"{options}\n\n[train]"))
+    path.write_text(
+        path.read_text().replace("options = {}\n\n[solve.learned]", f"{options}\n\n[solve.learned]")
+    )
     curate("run")
     code, _, err = curate("solve", "--policy", "threshold")
     assert code == ConfigError.exit_code

@@ -53,8 +53,8 @@ def contents(root: Path) -> tuple[list[str], dict[Path, bytes]]:
 def test_every_stage_command_has_the_option() -> None:
     """Every stage is listed."""
     stages = {
-        "pretrain", "segment", "predict", "repredict", "score", "solve", "export", "train-round",
-        "run",
+        "pretrain", "segment", "predict", "repredict", "score", "calibrate", "solve", "export",
+        "train-round", "run",
     }  # fmt: skip
     assert with_option("--dry-run") == stages | {"augment", "review import"}
 
@@ -110,7 +110,9 @@ def test_outside_a_workspace_the_graph_has_all_stages(
     """A folder that is named must be a workspace."""
     monkeypatch.chdir(tmp_path)
     shown = json.loads(curate("graph", "--json")[1])
-    assert tuple(each["name"] for each in shown) == ("pretrain", "segment", *STAGES, "train-round")
+    before_solve = STAGES.index("solve")
+    stages = (*STAGES[:before_solve], "calibrate", *STAGES[before_solve:])
+    assert tuple(each["name"] for each in shown) == ("pretrain", "segment", *stages, "train-round")
     code, _, err = curate("graph", "-w", tmp_path)
     assert code == WorkspaceError.exit_code
     assert "no workspace here" in err

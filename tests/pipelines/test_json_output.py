@@ -52,6 +52,7 @@ def commands_in_order(root: Path, data: Path) -> Mapping[str, Arguments]:
         "predict": there,
         "repredict": there,
         "score": there,
+        "calibrate": there,
         "solve": there,
         "export": there,
         "train-round": there,

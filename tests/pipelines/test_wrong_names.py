@@ -74,7 +74,10 @@ UNUSABLE = [
     ),
     (
         ("solve", "export", "train-round", "run"),
-        ("options = {}\n\n[train]", "options = {pspsl = {self_pased = false}}\n\n[train]"),
+        (
+            "options = {}\n\n[solve.learned]",
+            "options = {pspsl = {self_pased = false}}\n\n[solve.learned]",
+        ),
         "run.method: policy 'pspsl' has no option 'self_pased'; did you mean 'self_paced'?",
     ),
     (

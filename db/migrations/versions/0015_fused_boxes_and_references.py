@@ -5,7 +5,7 @@ from alembic import op
 from db.ddl import box, deleted_with, integer, prediction_key, real, table, text
 
 revision = "0015"
-down_revision = "0011"
+down_revision = "0012"
 branch_labels = None
 depends_on = None
 

@@ -18,9 +18,9 @@ from pipelines.assessment.audit import (
     describe_audit,
     run_audit,
 )
-from pipelines.assessment.audit_folds import open_folds
 from pipelines.engine.rounds import open_round
 from pipelines.labels.evidence import read_evidence
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.workspace import Workspace
 
 BIN = "SELECT low, labels, precision FROM audit_bin WHERE category = 'all' AND policy = 'uniform'"

@@ -21,7 +21,7 @@ from support.stored_rows import dump
 from support.toys import toy_document, write_toy_kitti
 
 from db.views import drop_views
-from pipelines.round import graph_of
+from pipelines.round import run_graph
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
@@ -195,7 +195,7 @@ def init_options(home: Path) -> list[object]:
 
 def run_stages_before(workspace: Workspace, until: str) -> None:
     """Run every stage before one."""
-    for stage in graph_of(workspace).stages:
+    for stage in run_graph(workspace).stages:
         if stage.name == until:
             break
         run_stage(workspace, stage.name)
@@ -203,7 +203,7 @@ def run_stages_before(workspace: Workspace, until: str) -> None:
 
 def downgrade(workspace: Workspace) -> None:
     """Downgrade the database to the schema of an older curate."""
-    with workspace.database.writing() as connection:
+    with workspace.database.writing(keys_known=True) as connection:
         drop_views(connection)
         older_schema.downgrade(connection, OLDER_SCHEMA)
 

@@ -262,10 +262,10 @@ def test_an_unknown_prior_is_rejected() -> None:
 
 
 def test_the_default_round_has_a_stage_per_registered_prior() -> None:
-    """In the order of the registry, between repredict and solve."""
+    """In the order of the registry, between repredict and calibrate."""
     graph = round_graph(tuple(PRIORS.classes))
     names = [each.name for each in graph.stages]
-    assert names[names.index("repredict") + 1 : names.index("solve")] == list(PRIORS.classes)
+    assert names[names.index("repredict") + 1 : names.index("calibrate")] == list(PRIORS.classes)
     alone = [each.name for each in round_graph(("semantic",)).stages]
     assert alone == [name for name in names if name not in PRIORS.classes or name == "semantic"]
     assert graph.stage("points").reads == ("frame", "ground_truth", "prediction")
