@@ -173,7 +173,8 @@ class Audit:
         label_counts: the same for the labels.
         figures: the figures by category, slice and policy.
         comparisons: the comparison of every two policies, by category.
-        sequences: number of sequences that were resampled; None if frames were.
+        sequences: number of sequences of the frames, which were resampled unless there is only one;
+            None if the frames are not in sequences.
         reference: the policy with the weighted recall at which weights are compared; None if no
             weights can be.
     """
@@ -190,9 +191,14 @@ class Audit:
     @property
     def resampled(self) -> str:
         """What the intervals are computed over, such as "25 frames"."""
-        if self.sequences is None:
+        if self.sequences in (None, 1):
             return f"{self.frames} frames"
         return f"{self.sequences} sequences"
+
+    @property
+    def conclusive(self) -> bool:
+        """Whether the frames are of enough sequences to distinguish a difference from chance."""
+        return self.sequences is None or self.sequences >= FEWEST_SEQUENCES
 
     def whole(self, category: str = ALL) -> dict[str, Figures]:
         """Return the figures over all distances and point counts, by policy."""
@@ -236,10 +242,12 @@ def audit(
     """
     unit = labels.resampling_unit
     units = int(unit.max(initial=-1)) + 1
+    sequences = units if units < labels.frames else None
+    if sequences == 1:
+        unit, units = np.arange(labels.frames), labels.frames
     resampling = Resampling(draw_frames(generator, units, replicates), unit, bins)
     seed = int(generator.integers(2**32))
     reference = _usable_reference(weights, reference)
-    sequences = units if units < labels.frames else None
     conclusive = sequences is None or sequences >= FEWEST_SEQUENCES
     figures: list[Figures] = []
     comparisons: list[Comparison] = []

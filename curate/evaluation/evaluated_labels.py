@@ -86,14 +86,11 @@ class EvaluatedLabels:
 
     @property
     def resampling_unit(self) -> Int[np.ndarray, " f"]:
-        """(f,) int64 number of the unit of each frame: its sequence, or the frame itself.
-
-        With a single sequence, each frame is a unit.
-        """
+        """(f,) int64 number of the unit of each frame: its sequence, or the frame itself."""
         numbers: dict[str | int, int] = {}
         names = [name or frame for frame, name in enumerate(self.sequence.tolist())]
         unit = [numbers.setdefault(name, len(numbers)) for name in names]
-        return np.array(unit if len(numbers) > 1 else range(self.frames), dtype=np.int64)
+        return np.array(unit, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.frame_index)

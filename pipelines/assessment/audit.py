@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import select
 
+from curate.datasets.base import sequences_of
 from curate.detections import Detections
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
@@ -55,6 +56,7 @@ class AuditRequest:
         names: names of policies and of `EVIDENCE`.
         overlap: the overlap to match labels by, "bev" or "3d".
         replicates: number of bootstrap draws.
+        reference: the name whose weighted recall the others are brought to; None for run.method.
     """
 
     split: str = "val"
@@ -63,6 +65,7 @@ class AuditRequest:
     names: tuple[str, ...] = (*POLICIES, *EVIDENCE)
     overlap: Overlap = "bev"
     replicates: int = 1000
+    reference: str | None = None
 
     @property
     def frames(self) -> str:
@@ -138,6 +141,7 @@ def run_audit(
         weights,
         workspace.config.dataset.categories,
         np.random.default_rng([workspace.config.run.seed, contexts[0].number]),
+        reference=request.reference or workspace.config.run.method,
         replicates=request.replicates,
     )
     unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
@@ -163,6 +167,11 @@ def describe_audit(found: AuditedRound) -> list[str]:
             "No object counts: the ground truth of these frames has "
             + (", ".join(describe_others(found.figures.counts)) or "no objects")
             + ". Check dataset.categories."
+        )
+    if request.reference not in (None, found.figures.reference):
+        sentences.append(
+            f"{request.reference} gives no weight here, so the reference is "
+            f"{found.figures.reference or 'missing'}."
         )
     if "score" in request.names:
         sentences.append(f"The score {describe_score(found.score_meaning)}.")
@@ -192,6 +201,10 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
     if request.split not in ("val", "labeled"):
         raise ConfigError(
             f"--split {request.split}: use val or labeled; other frames have no ground truth"
+        )
+    if request.reference not in (None, *request.names):
+        raise ConfigError(
+            f"--reference {request.reference}: not audited; use one of {', '.join(request.names)}"
         )
     check_executor(workspace.config)
     for name in request.policies:
@@ -307,6 +320,7 @@ def _frames(
     labels = workspace.predictions(context.number, complete)
     points = _points(workspace, context.number)
     truth = workspace.ground_truth(split)
+    sequences = sequences_of(workspace.dataset, [name for _, name in frames])
     for key, name in frames:
         found = labels.get(key, Detections.empty())
         frame = workspace.dataset.read(name, points=False)
@@ -315,6 +329,7 @@ def _frames(
             truth[name],
             rectangles_in_image(found.boxes, frame),
             np.array([points.get((key, k), np.nan) for k in range(len(found))], dtype=np.float64),
+            sequences.get(name, ""),
         )
 
 

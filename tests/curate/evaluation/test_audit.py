@@ -274,7 +274,9 @@ def test_few_sequences_cannot_show_that_a_difference_is_real():
         found = audit_of(in_sequences(labels, count), weights)
         assert found.sequences == count
         assert found.compare("good", "blind").beyond_chance is real
-    assert audit_of(in_sequences(labels, 1), weights).sequences is None
+    single = audit_of(in_sequences(labels, 1), weights)
+    assert (single.sequences, single.resampled) == (1, "60 frames")
+    assert not single.compare("good", "blind").beyond_chance
 
 
 def audit_of(labels, weights):
