@@ -4,7 +4,7 @@
 `prior_NAME`, which is created when the source is first used, and a row in `evidence_source` with
 its declaration. From these rows the view `weighted_labels` gets its columns after the core ones. A
 column of a table of the schema that only some workspaces use, such as the camera of the semantic
-prior, is declared in the same way.
+prior or the probability of a weight, is declared in the same way.
 """
 
 import json
@@ -31,7 +31,9 @@ from curate.exporters.columns import WEIGHTED_LABELS, as_optional
 from curate.priors.base import Column as Declared
 from db.models import Base, EvidenceSource
 
-OWN_TABLES: Mapping[str, str] = {"points": "point_prior", "semantic": "semantic_prior"}
+OWN_TABLES: Mapping[str, str] = {
+    "points": "point_prior", "semantic": "semantic_prior", "probability": "weight",
+}  # fmt: skip
 """Sources with a table in the schema, and the name of that table."""
 _KEY = ("round", "frame_id", "k")
 _TYPES: Mapping[str, TypeEngine[Any]] = {
@@ -68,6 +70,15 @@ class Declaration:
         return self.name, self.source, columns, self.rho_column
 
 
+PROBABILITY = Declaration(
+    "probability",
+    "calibrate",
+    (Declared("probability", "float64", "1", "p, that the label is correct", optional=True),),
+    None,
+)
+"""The column of the weights of policies that estimate a probability."""
+
+
 def evidence_table(declaration: Declaration) -> Table:
     """Return the table of a source."""
     if declaration.name in OWN_TABLES:
@@ -88,10 +99,10 @@ def evidence_table(declaration: Declaration) -> Table:
 
 
 def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
-    """Return the stored declarations, sorted by name."""
+    """Return the stored declarations, sorted by name; the probability comes after the evidence."""
     c = _RECORD.c
     rows = connection.execute(select(c.name, c.source, c.columns, c.rho_column).order_by(c.name))
-    return tuple(
+    found = (
         Declaration(
             row.name,
             row.source,
@@ -100,6 +111,7 @@ def read_declarations(connection: Connection) -> tuple[Declaration, ...]:
         )
         for row in rows
     )
+    return tuple(sorted(found, key=lambda each: each.name == PROBABILITY.name))
 
 
 def declare(connection: Connection, declaration: Declaration) -> None:

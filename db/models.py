@@ -83,7 +83,7 @@ class Frame(Base):
         UniqueConstraint("dataset", "frame"),
         UniqueConstraint("id", "split"),
         Index("ix_frame_frame", "frame"),
-        CheckConstraint("split IN ('labeled', 'unlabeled', 'val')", name="split"),
+        CheckConstraint("split IN ('labeled', 'unlabeled', 'val', 'calibration')", name="split"),
         CheckConstraint(
             "split <> 'unlabeled' OR label_path IS NULL", name="unlabeled_has_no_label"
         ),
@@ -92,7 +92,7 @@ class Frame(Base):
     id: Mapped[int] = mapped_column(primary_key=True, doc="number of the frame in this database")
     dataset: Mapped[str] = mapped_column(doc="kind of the data set, as in curate.toml")
     frame: Mapped[str] = mapped_column(comment="frame id within the data set")
-    split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val")
+    split: Mapped[str] = mapped_column(comment="labeled | unlabeled | val | calibration")
     points_path: Mapped[str] = mapped_column(comment="relative to the data set's root")
     image_path: Mapped[str | None] = mapped_column(
         sort_order=1,
@@ -114,7 +114,9 @@ class SplitList(Base):
         primary_key=True, comment="chosen | dataset (its own) | file (given to init)"
     )
     name: Mapped[str] = mapped_column(
-        primary_key=True, comment="labeled | unlabeled | val, or of the data set's list"
+        primary_key=True,
+        comment="labeled | unlabeled | val, or of the data set's list",
+        doc="labeled | unlabeled | val | calibration, or of the data set's list",
     )
     path: Mapped[str | None] = mapped_column(comment="of the file", doc="path of the file")
     frames: Mapped[int] = mapped_column(comment="how many", doc="number of frames")
@@ -123,7 +125,7 @@ class SplitList(Base):
 
 
 class GroundTruth(Base):
-    """The annotated objects of labeled and val frames.
+    """The annotated objects of labeled, val and calibration frames.
 
     The foreign key includes the frame's split, so the database rejects a row of an unlabeled frame.
     """
@@ -131,13 +133,13 @@ class GroundTruth(Base):
     __tablename__ = "ground_truth"
     __table_args__ = (
         ForeignKeyConstraint(["frame_id", "split"], ["frame.id", "frame.split"]),
-        CheckConstraint("split IN ('labeled', 'val')", name="never_unlabeled"),
+        CheckConstraint("split IN ('labeled', 'val', 'calibration')", name="never_unlabeled"),
         {"sqlite_with_rowid": False},
     )
 
     frame_id: Mapped[Key] = mapped_column(doc="frame.id")
     k: Mapped[Key] = mapped_column(doc="number of the object within its frame")
-    split: Mapped[str] = mapped_column(doc="labeled | val")
+    split: Mapped[str] = mapped_column(doc="labeled | val | calibration")
     category: Mapped[str] = mapped_column(doc="category of the object")
     x: Mapped[Metres | None] = mapped_column(doc="box centre, forward of the LiDAR")
     y: Mapped[Metres | None] = mapped_column(doc="box centre, to the left of the LiDAR")
@@ -376,6 +378,95 @@ class EvidenceSource(Base):
     )
 
 
+class Calibration(Base):
+    """The fit of a round that turns the evidence of a label into the probability that it is correct.
+
+    It is made from the labels of frames with ground truth that the teacher has not been trained on.
+    `calibration_label` has the labels that no fit has used, for the bound `max_wrong`.
+    """
+
+    __tablename__ = "calibration"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    round: Mapped[int] = mapped_column(
+        ForeignKey("round.number"), primary_key=True, doc="round.number"
+    )
+    source: Mapped[str] = mapped_column(
+        comment="calibration | folds",
+        doc="where the labels are from: calibration (frames set aside) | folds (of X_l)",
+    )
+    folds: Mapped[int] = mapped_column(
+        comment="0 = frames set aside", doc="number of folds; 0 = frames set aside"
+    )
+    overlap: Mapped[str] = mapped_column(
+        comment="bev | 3d", doc="overlap that makes a label correct: bev | 3d"
+    )
+    thresholds: Mapped[str] = mapped_column(
+        comment="kitti | relaxed", doc="IoU thresholds of that overlap: kitti | relaxed"
+    )
+    teacher: Mapped[str] = mapped_column(
+        comment="hash of the checkpoint, '' for a command without one",
+        doc="hash of the teacher's checkpoint; '' for a command without one",
+    )
+    frames: Mapped[int] = mapped_column(
+        comment="with ground truth", doc="frames of the fit, with or without labels"
+    )
+    labels: Mapped[int] = mapped_column(
+        comment="that are right or wrong", doc="labels of the fit, without the neutral ones"
+    )
+    neutral: Mapped[int] = mapped_column(
+        comment="further labels that are neither",
+        doc="labels that are neither correct nor wrong, and are not used",
+    )
+    right_labels: Mapped[int] = mapped_column(doc="correct labels of the fit")
+    auroc: Mapped[float | None] = mapped_column(
+        comment="out of sample", doc="AUROC of the probability in frames that the fit did not use"
+    )
+    calibration_error: Mapped[float | None] = mapped_column(
+        comment="out of sample",
+        doc="calibration error of the probability in frames that the fit did not use",
+    )
+    fit: Mapped[str | None] = mapped_column(
+        comment="JSON; null = too few labels",
+        doc="JSON: evidence, scaling and coefficients; null = too few labels",
+    )
+    fallback: Mapped[str | None] = mapped_column(
+        comment="why there is no fit; null = there is one",
+        doc="why there is no fit, so that pspsl weights the labels; null = there is one",
+    )
+    unit: Mapped[str] = mapped_column(
+        comment="frame | sequence",
+        doc="what is exchangeable with the unlabeled frames: frame | sequence",
+    )
+    held_out_frames: Mapped[int] = mapped_column(
+        comment="for max_wrong; 0 = none",
+        doc="frames of calibration_label, with or without labels; 0 = max_wrong is not set",
+    )
+
+
+class CalibrationLabel(Base):
+    """A label of a frame that neither the teacher nor the fit has used, for the bound `max_wrong`.
+
+    The teacher of the round has predicted it.
+    """
+
+    __tablename__ = "calibration_label"
+    __table_args__ = _evidence()
+
+    round: Mapped[Key] = mapped_column(doc="prediction.round")
+    frame_id: Mapped[Key] = mapped_column(doc="prediction.frame_id")
+    k: Mapped[Key] = mapped_column(doc="prediction.k")
+    probability: Mapped[Share] = mapped_column(doc="probability that it is correct, by the fit")
+    correct: Mapped[int | None] = mapped_column(
+        comment="1 = right, 0 = wrong, null = neither",
+        doc="1 = correct, 0 = wrong, null = neither, such as a label in a DontCare region",
+    )
+    unit: Mapped[str] = mapped_column(
+        comment="the sequence, or the frame",
+        doc="sequence of the frame; the frame itself where there are no sequences",
+    )
+
+
 class Weight(Base):
     """The reliability weight v that one policy gives a label; a label has one row per policy.
 
@@ -396,6 +487,10 @@ class Weight(Base):
     )
     rho_det: Mapped[float | None] = mapped_column(comment="product of the priors")
     v: Mapped[Share] = mapped_column(doc="weight in [0, 1]; the policy defines what 0 means")
+    probability: Mapped[float | None] = mapped_column(
+        comment="that the label is right; null = not estimated",
+        doc="probability that the label is correct; null = the policy does not estimate it",
+    )
 
 
 class LabelCount(Base):

@@ -144,7 +144,8 @@ class Database:
         self._write_ahead()
         if views_current:
             return
-        with self.writing() as connection:
+        # A migration may copy a table that others refer to.
+        with self.writing(keys_known=True) as connection:
             wait_for_transactions(connection, _MIGRATION_LOCK)
             # Another process may have migrated the database while this one waited. It has also
             # made a backup of the older schema, which a backup made now would replace.

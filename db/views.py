@@ -24,7 +24,7 @@ from sqlalchemy import (
 
 from curate.exporters.base import WEIGHTED_LABEL_COLUMNS
 from db.evidence import Declaration, label_columns, read_declarations
-from db.models import BOX_COLUMNS, Base, ViewDefinition
+from db.models import BOX_COLUMNS, Base, ViewDefinition, Weight
 
 # The views with their core columns, for use in a FROM clause.
 WEIGHTED_LABELS = table("weighted_labels", *map(column, WEIGHTED_LABEL_COLUMNS))
@@ -115,7 +115,11 @@ def _weighted_labels(further: Sequence[Declaration]) -> str:
 
 def _stored(further: Sequence[Declaration]) -> tuple[str, str]:
     """Return the columns of further sources, and the joins of all evidence."""
-    aliases = {each: f"s{i}" for i, each in enumerate(further)}
+    # The weight itself is joined already.
+    aliases = {
+        each: "w" if each.table == Weight.__tablename__ else f"s{i}"
+        for i, each in enumerate(further)
+    }
     columns = [(alias, column) for each, alias in aliases.items() for column in each.columns]
     return (
         "".join(f', {alias}."{column.name}"' for alias, column in columns),
@@ -123,6 +127,7 @@ def _stored(further: Sequence[Declaration]) -> tuple[str, str]:
         + "".join(
             _FURTHER.format(table=each.table, alias=each_alias)
             for each, each_alias in aliases.items()
+            if each_alias != "w"
         ),
     )
 

@@ -479,6 +479,8 @@ def open_policy(config: Config, name: str) -> Policy:
             "scope": lambda: section.scope,
             "quantile": lambda: section.quantile,
             "self_paced": lambda: section.self_paced,
+            "precision": lambda: section.learned.precision,
+            "max_wrong": lambda: section.learned.max_wrong,
         },
         options=section.options.get(name, {}),
     )

@@ -218,6 +218,7 @@ POLICIES = Registry(
     "curate.weighting.base:Policy",
     {
         "pspsl": "curate.weighting.self_paced:PSPSL",
+        "learned": "curate.weighting.learned:Learned",
         "spsl": "curate.weighting.self_paced:SPSL",
         "uniform": "curate.weighting.uniform:Uniform",
         "uda": "curate.weighting.uniform:Uniform",

@@ -22,8 +22,8 @@ LAYERS = {
     "curate": (
         "shapes", "ranges", "errors", "spelling", "warnings_once", "files", "option_values",
         "frames", "geometry", "detections", "consistency", "datasets", "category_names",
-        "simulation", "segmenters", "priors", "weighting", "evaluation", "exporters", "detectors",
-        "firewall", "viewing", "review", "training", "__main__",
+        "simulation", "segmenters", "priors", "calibration", "weighting", "evaluation", "exporters",
+        "detectors", "firewall", "viewing", "review", "training", "__main__",
     ),
     "pipelines": (
         "user_modules", "registry", "workspace", "devices", "assembly", "category_names", "engine",

@@ -80,6 +80,10 @@ class Evidence:
             prior has not scored the label.
         iou: (n,) the detector's estimate of the label's 3D IoU with its object, in [0, 1]; NaN if
             there is no estimate. All NaN by default.
+        probability: (n,) probability that the label is correct, by a calibration of this round, in
+            [0, 1]. All NaN by default.
+        p_value: (n,) conformal p-value of the hypothesis that the label is wrong, in [0, 1]. All
+            NaN by default.
         boxes: (n, 7) in the LiDAR frame; needed only with a memory.
         unseen: (n,) bool, labels without image evidence, which must not outweigh the others. By
             default there are none.
@@ -96,11 +100,14 @@ class Evidence:
     boxes: np.ndarray = field(default_factory=empty_boxes)
     memory: Memory | None = None
     unseen: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    probability: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    p_value: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         """Raise DataError if a column is not aligned or out of its range."""
-        if len(self.iou) == 0:
-            object.__setattr__(self, "iou", np.full(len(self.loss), np.nan))
+        for name in ("iou", "probability", "p_value"):
+            if len(getattr(self, name)) == 0:
+                object.__setattr__(self, name, np.full(len(self.loss), np.nan))
         if len(self.unseen) == 0:
             object.__setattr__(self, "unseen", np.zeros(len(self.loss), dtype=bool))
         if self.memory is not None and len(self.boxes) != len(self.loss):
@@ -144,7 +151,14 @@ class Evidence:
 
     def _numbers(self) -> dict[str, np.ndarray]:
         """Return the numeric columns that have a range."""
-        return {"score": self.score, "loss": self.loss, "iou": self.iou, **self.rho}
+        return {
+            "score": self.score,
+            "loss": self.loss,
+            "iou": self.iou,
+            "probability": self.probability,
+            "p_value": self.p_value,
+            **self.rho,
+        }
 
 
 @dataclass(frozen=True)
@@ -157,11 +171,14 @@ class Weights:
             label of the group matched.
         dropped: (n,) bool, labels that are not stored at all: their region is background, whatever
             a weight of 0 means. v must be 0 for a dropped label. By default no label is dropped.
+        remark: what the user should know of these weights, such as a setting that is out of reach;
+            "" for nothing.
     """
 
     v: Float[np.ndarray, " n"]
     lambda_u: Float[np.ndarray, " n"]
     dropped: Bool[np.ndarray, " n_or_0"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    remark: str = ""
 
     def __post_init__(self) -> None:
         """Set the default of `dropped`."""
@@ -169,9 +186,9 @@ class Weights:
             object.__setattr__(self, "dropped", np.zeros(len(self.v), dtype=bool))
 
     @classmethod
-    def without_age(cls, v: Float[np.ndarray, " n"]) -> "Weights":
+    def without_age(cls, v: Float[np.ndarray, " n"], remark: str = "") -> "Weights":
         """Return weights without an age parameter: lambda_u is NaN."""
-        return cls(v, np.full(len(v), np.nan))
+        return cls(v, np.full(len(v), np.nan), remark=remark)
 
 
 class Policy(Protocol):
@@ -191,7 +208,10 @@ class Policy(Protocol):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Return the columns of `Evidence` that the policy reads; others may be NaN or ""."""
+        """Return the columns of `Evidence` that the policy reads; others may be NaN or "".
+
+        A policy that reads "probability" or "p_value" needs a calibration of the round.
+        """
         return ("category", "score", "iou", "loss")
 
     def weigh(self, evidence: Evidence, age: Age) -> Weights:

@@ -83,7 +83,7 @@ def read_evidence(
     if boxes:
         tables |= dict.fromkeys(BOX_COLUMNS, "prediction")
     with workspace.database.reading() as connection:
-        found = bulk.select_columns(connection, _aligned(round_number, tables))
+        found = bulk.select_columns(connection, aligned_query(round_number, tables))
     inside = np.isin(found["frame_id"], np.asarray(frames, dtype=np.int64))
     if not inside.all():
         found = {name: column[inside] for name, column in found.items()}
@@ -101,7 +101,7 @@ def read_evidence(
     )
 
 
-def _aligned(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
+def aligned_query(round_number: int, tables: Mapping[str, str]) -> Select[Any]:
     """Return the query for the predictions of a round with columns of several tables.
 
     Args:

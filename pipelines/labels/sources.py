@@ -10,7 +10,7 @@ from curate.exporters.columns import WEIGHTED_LABELS
 from curate.priors.base import Column, check_declaration
 from curate.priors.semantic import SemanticPrior
 from db import bulk
-from db.evidence import OWN_TABLES, Declaration, declare, read_declarations
+from db.evidence import OWN_TABLES, PROBABILITY, Declaration, declare, read_declarations
 from db.views import create_views, drop_views
 from pipelines.registry import PRIORS
 from pipelines.workspace.workspace import Workspace
@@ -19,7 +19,8 @@ _log = logging.getLogger(__name__)
 _RESERVED = frozenset(
     {
         *(column.name for column in (*WEIGHTED_LABELS, *SemanticPrior.camera_columns)),
-        *("probability", "frame_id"),
+        *(column.name for column in PROBABILITY.columns),
+        "frame_id",
     }
 )
 _FRAME_MEMBERS = ("measured_columns", "measure", "rate")
@@ -134,6 +135,11 @@ def prepare_table(workspace: Workspace, source: Source) -> None:
         _declare(workspace, source.declaration)
 
 
+def prepare_probability(workspace: Workspace) -> None:
+    """Give the view `weighted_labels` the column with the probability of each label."""
+    _declare(workspace, PROBABILITY)
+
+
 def _declare(workspace: Workspace, declaration: Declaration) -> None:
     database = workspace.database
     with database.reading() as connection:
@@ -167,6 +173,7 @@ def _declare(workspace: Workspace, declaration: Declaration) -> None:
 def report_unused(workspace: Workspace) -> None:
     """Log a warning for each source with stored evidence that is no longer in run.priors."""
     active = {source_of(name).declaration.name for name in workspace.config.run.priors}
+    active.add(PROBABILITY.name)
     with workspace.database.reading() as connection:
         stored = read_declarations(connection)
     for each in stored:

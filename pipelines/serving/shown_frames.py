@@ -12,7 +12,7 @@ from curate.errors import ConfigError
 from curate.priors.base import Column
 from curate.viewing.canvas import jpeg
 from db import bulk
-from db.evidence import OWN_TABLES, evidence_table, label_columns, read_declarations
+from db.evidence import OWN_TABLES, PROBABILITY, evidence_table, label_columns, read_declarations
 from db.models import BOX_COLUMNS
 from pipelines.labels.human_labels import DecidedLabels, decided_labels
 from pipelines.labels.of_one_frame import chosen_round
@@ -151,12 +151,15 @@ class FramePages:
         prediction, weight = bulk.table("prediction"), bulk.table("weight")
         with self._workspace.database.reading() as connection:
             declared = read_declarations(connection)
-        tables = [bulk.table(name) for name in ("consistency", *OWN_TABLES.values())]
+        stored = [name for name in OWN_TABLES.values() if name != weight.name]
+        tables = [bulk.table(name) for name in ("consistency", *stored)]
         tables += [evidence_table(each) for each in declared if each.name not in OWN_TABLES]
         evidence = [
             column.name for column in label_columns(declared) if _is_evidence(column, tables)
         ]
-        names = ("k", "category", "x", "y", "score", *evidence, "rho_det", "lambda_u", "v")
+        estimated = [column.name for column in PROBABILITY.columns if PROBABILITY in declared]
+        weighted = ("rho_det", "lambda_u", *estimated, "v")
+        names = ("k", "category", "x", "y", "score", *evidence, *weighted)
         joined: Any = prediction
         columns = {**prediction.c}
         for table in (*tables, weight):

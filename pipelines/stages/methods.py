@@ -56,6 +56,7 @@ METHODS: Final[Mapping[str, Method]] = {
         Method(
             "pspsl", "student", "PSPSL-3D: v = rho_det (1 - L / lambda) (An et al. 2023, Eq. 11)"
         ),
+        Method("learned", "student", "v = p^gamma, p = probability that the label is correct"),
         Method("threshold", "student", "weight 1 for every label with a score of at least 0.3"),
         Method("st3d", "student", "keep, ignore, drop with a memory (ST3D, Yang et al. 2021)"),
         Method("hssda", "ema", "two thresholds from the data (HSSDA, Liu et al. 2023)"),

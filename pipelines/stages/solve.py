@@ -12,9 +12,16 @@ from db import bulk, weight_index
 from pipelines.assembly import check_policy, open_policy
 from pipelines.engine.progress import Progress
 from pipelines.engine.stage import Product, RoundContext, RoundJob, Settings
+from pipelines.labels.calibration import (
+    calibration_settings,
+    check_held_out,
+    needs_calibration,
+    open_usable_policy,
+    with_estimates,
+)
 from pipelines.labels.evidence import LabelKeys, read_evidence, read_memory, solved_fingerprint
 from pipelines.labels.human_labels import refresh_matches
-from pipelines.labels.sources import report_unused
+from pipelines.labels.sources import prepare_probability, report_unused
 from pipelines.workspace.workspace import Workspace
 
 TRUSTED = 0.5  # labels with a greater weight count as trusted
@@ -33,23 +40,25 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
         "rounds": context.rounds,
         "priors": workspace.config.run.priors,
         "memory": _memory_fingerprint(workspace, context, policy),
+        **calibration_settings(workspace, context.number, policy),
     }
 
 
 def check(workspace: Workspace, policy: str) -> None:
-    """Check that the policy can be created with its settings.
+    """Check that the policy can be created with its settings, and has the frames that it needs.
 
     Raises:
-        ConfigError: if it cannot.
+        ConfigError: if it cannot, or has not.
     """
     check_policy(workspace.config, policy)
+    check_held_out(workspace, policy)
 
 
 def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     """Compute the policy's weights of the round."""
     report_unused(workspace)
     context, policy = job.context, job.policy
-    opened = open_policy(workspace.config, policy)
+    opened, reason = open_usable_policy(workspace, context.number, policy)
     needs_memory = context.number > 1 and opened.remembers
     keys, evidence = read_evidence(
         workspace,
@@ -58,6 +67,9 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
         boxes=needs_memory,
         columns=opened.reads,
     )
+    if needs_calibration(opened):
+        prepare_probability(workspace)
+        evidence = with_estimates(workspace, context.number, keys, evidence, opened.reads)
     if needs_memory:
         evidence = replace(evidence, memory=read_memory(workspace, context.number - 1, policy))
     weights = opened.weigh(evidence, context.age)
@@ -79,6 +91,7 @@ def run(workspace: Workspace, job: RoundJob, _progress: Progress) -> Product:
     summary = f"{len(keys)} labels, {trusted} with weight > 0, their weights sum to {total:.1f}"
     dropped = int(weights.dropped.sum())
     summary = f"{summary}, {dropped} dropped" if dropped else summary
+    summary = "; ".join(filter(None, (summary, weights.remark, reason)))
     # The keys need no check: the claim keeps other processes from changing the predictions.
     return Product(summary, write, keys_known=True)
 
@@ -110,6 +123,7 @@ def _columns(keys: LabelKeys, weights: Weights, evidence: Evidence) -> dict[str,
         "lambda_u": weights.lambda_u[kept],
         "rho_det": evidence.rho_det[kept],
         "v": weights.v[kept],
+        "probability": evidence.probability[kept],
     }
 
 

@@ -424,6 +424,25 @@ class SemanticSection(Section):
     )
 
 
+class LearnedSection(Section):
+    """The policy learned, which weights a label by the probability that it is correct."""
+
+    precision: Annotated[float, Field(gt=0, lt=1)] = Field(
+        default=0.8,
+        description="Requested weighted precision: the share of the weight that is on correct "
+        "labels.",
+        json_schema_extra=_unit("1"),
+    )
+    max_wrong: Annotated[float, Field(gt=0, lt=1)] | None = Field(
+        default=None,
+        description="Largest expected share of wrong labels among the selected ones. With it, "
+        "selected labels have weight 1 and others 0, and precision is not used. It needs frames "
+        "that are set aside for calibration.",
+        json_schema_extra=_unit("1"),
+        examples=[0.1],
+    )
+
+
 class SolveSection(Section):
     """How policies weight the labels. run.method selects the policy."""
 
@@ -442,6 +461,9 @@ class SolveSection(Section):
         default=True,
         description="Whether pspsl uses the factor 1 - L / lambda. With false, the weight is the "
         "product of the priors, and no repredictions are needed.",
+    )
+    learned: LearnedSection = Field(
+        default=LearnedSection(), description="Settings of the policy learned."
     )
     options: dict[PolicyName, Options] = Field(
         default={},

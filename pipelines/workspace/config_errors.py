@@ -9,7 +9,7 @@ from pydantic_core import ErrorDetails
 
 from curate.files.toml_text import toml, toml_key
 from curate.spelling import did_you_mean
-from pipelines.workspace.reference import Accepted, accepted_by
+from pipelines.workspace.reference import Accepted, accepted_by, section_of
 
 _LONGEST = 80  # characters of a wrong value that are shown
 
@@ -29,7 +29,7 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> tuple[str, str]:
     known, field, depth = _walk(model, path)
     if error["type"] == "extra_forbidden":
         return _unknown_key(path, model, known)
-    accepted = Accepted("table") if field is None or _model_of(field) else accepted_by(field)
+    accepted = Accepted("table") if field is None or section_of(field) else accepted_by(field)
     inside = path[depth:] if accepted.type.startswith("list") else []
     if accepted.type != "table":
         path = path[:depth]
@@ -63,7 +63,7 @@ def _elsewhere(key: str, model: type[BaseModel]) -> str:
     found = [
         f"{name}.{key}"
         for name, field in model.model_fields.items()
-        if (section := _model_of(field)) and key in section.model_fields
+        if (section := section_of(field)) and key in section.model_fields
     ]
     return f"; did you mean {' or '.join(found)}?" if found else ""
 
@@ -78,16 +78,11 @@ def _walk(
         if found is None:
             break
         field, depth = found, depth + 1
-        inner = _model_of(field)
+        inner = section_of(field)
         if inner is None:
             break
         model = inner
     return tuple(model.model_fields), field, depth
-
-
-def _model_of(field: FieldInfo) -> type[BaseModel] | None:
-    kind = field.annotation
-    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
 
 
 def _shown(value: Any) -> str:

@@ -3,6 +3,8 @@
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 from curate.errors import ConfigError
@@ -33,8 +35,9 @@ def write_config(path: Path, config: Config) -> None:
     lines: list[str] = []
     for name, section in sections_of(Config):
         lines += ["", f"[{name}]", *_comment(section.__doc__ or ""), ""]
+        chosen = reduce(getitem, name.split("."), values)
         for setting in settings_of(section):
-            lines += _setting_lines(setting, values[name])
+            lines += _setting_lines(setting, chosen)
     write_schema(path.parent)
     replace_file(path, (_HEADER + "\n".join(lines) + "\n").encode())
 

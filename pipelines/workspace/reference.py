@@ -71,15 +71,24 @@ class Setting:
 
 
 def sections_of(config: type[BaseModel]) -> Iterator[tuple[str, type[BaseModel]]]:
-    """Yield the sections of a configuration: name and class."""
+    """Yield the sections of a configuration, each before those in it: name and class."""
     for name, field in config.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield name, field.annotation
+        if section := section_of(field):
+            yield name, section
+            yield from ((f"{name}.{inner}", found) for inner, found in sections_of(section))
+
+
+def section_of(field: FieldInfo) -> type[BaseModel] | None:
+    """Return the class of a field that is a section; None for a setting."""
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
 
 
 def settings_of(section: type[BaseModel]) -> Iterator[Setting]:
-    """Yield the settings of a section in their order."""
+    """Yield the settings of a section in their order, without those of sections in it."""
     for key, field in section.model_fields.items():
+        if section_of(field):
+            continue
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
         if field.is_required():
             default = None

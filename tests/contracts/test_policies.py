@@ -37,6 +37,8 @@ def evidence(n: int, seed: int = 0, *, remembered: int | None = None) -> Evidenc
         loss=loss,
         rho={"rho_diff": rng.random(n), "rho_anno": rng.random(n)},
         memory=memory,
+        probability=rng.random(n),
+        p_value=rng.random(n),
     )
 
 
@@ -70,6 +72,8 @@ def test_weights_do_not_depend_on_the_order_of_the_labels(policy) -> None:
         labels.iou[order],
         labels.boxes[order],
         labels.memory,
+        probability=labels.probability[order],
+        p_value=labels.p_value[order],
     )
     expected, got = policy.weigh(labels, Age(1, 2)), policy.weigh(shuffled, Age(1, 2))
     assert got.v == pytest.approx(expected.v[order])
@@ -81,7 +85,7 @@ def test_undeclared_columns_do_not_change_the_weights(policy) -> None:
     labels, reads = evidence(100), policy.reads
     nothing = {
         "category": np.full(100, ""),
-        **dict.fromkeys(("score", "iou"), np.full(100, np.nan)),
+        **dict.fromkeys(("score", "iou", "probability", "p_value"), np.full(100, np.nan)),
     }
     blank = {name: column for name, column in nothing.items() if name not in reads}
     if "loss" not in reads:

@@ -38,11 +38,13 @@ def test_rows_and_columns_are_stored_equally(database: Database, count: int) -> 
     """To the last bit, for any number of rows per statement; null stays null."""
     keys = range(1000, 1000 + count)
     rows = [(1, 1, k, "Car", k / 7777, *[k / 3] * 7, None) for k in keys]
-    weights = [(1, 1, k, "spsl", k / 3 if k % 2 else None, k / 7777, k / 9999) for k in keys]
+    weights = [
+        (1, 1, k, "spsl", k / 3 if k % 2 else None, k / 7777, k / 9999, k / 8888) for k in keys
+    ]
     with database.writing() as connection:
         store(connection, "prediction", rows)
-        columns = [[row[i] for row in weights] for i in range(7)]
-        values = dict(zip(COLUMNS["weight"], columns, strict=True))
+        columns = [[row[i] for row in weights] for i in range(8)]
+        values = dict(zip((*COLUMNS["weight"], "probability"), columns, strict=True))
         bulk.insert(connection, "weight", values | {"round": 1, "policy": "spsl"})
         table = bulk.table("prediction")
         found = bulk.select(connection, select(table).where(table.c.k >= 1000).order_by(table.c.k))

@@ -78,6 +78,37 @@ def test_a_database_of_an_older_curate_is_migrated(database: Database) -> None:
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one() == 0
 
 
+def test_a_database_without_a_calibration_split_is_migrated(database: Database) -> None:
+    """The tables with its constraint keep rows, references, indexes and triggers."""
+    keys = {split: _frame(database, split) for split in ("labeled", "unlabeled", "val")}
+    with database.writing() as connection:
+        store(connection, "ground_truth", [_truth(keys["val"], "val")])
+        store(connection, "round", [(1, 1, None, "{}", "0", 0)])
+        store(connection, "prediction", [(1, keys["val"], 0, "Car", 0.5, *[1.0] * 7, None)])
+    with database.writing(keys_known=True) as connection:
+        drop_views(connection)
+        downgrade(connection, "0011")
+    with pytest.raises(DatabaseError):
+        _frame(database, "calibration")
+    database.close()
+    migrated = Database(database.url)
+    key = _frame(migrated, "calibration")
+    with migrated.writing() as connection:
+        store(connection, "ground_truth", [_truth(key, "calibration")])
+        for name in ("frame", "ground_truth"):
+            rows = connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one()
+            assert rows == {"frame": 4, "ground_truth": 2}[name]
+        indexes = {each["name"] for each in inspect(connection).get_indexes("frame")}
+        assert "ix_frame_frame" in indexes
+        if connection.dialect.name == "sqlite":
+            assert connection.exec_driver_sql("PRAGMA foreign_key_check").all() == []
+    for wrong in ("DELETE FROM frame", "UPDATE frame SET split = 'other'"):
+        with pytest.raises(DatabaseError), migrated.writing() as connection:
+            connection.exec_driver_sql(wrong)
+    with pytest.raises((LeakageError, DatabaseError)), migrated.writing() as connection:
+        store(connection, "ground_truth", [_truth(keys["unlabeled"], "calibration")])
+
+
 def test_an_older_database_is_copied_before_it_is_migrated(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

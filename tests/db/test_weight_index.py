@@ -84,7 +84,7 @@ def test_only_the_index_of_the_policy_is_rebuilt(
 def test_weights_of_an_older_schema_get_their_indices(database: Database) -> None:
     """The downgrade leaves the single index of that schema."""
     weight_index.ensure_index(database, "pspsl")
-    with database.writing() as connection:
+    with database.writing(keys_known=True) as connection:
         drop_views(connection)
         downgrade(connection, "0007")
     database.close()

@@ -203,7 +203,7 @@ def run_stages_before(workspace: Workspace, until: str) -> None:
 
 def downgrade(workspace: Workspace) -> None:
     """Downgrade the database to the schema of an older curate."""
-    with workspace.database.writing() as connection:
+    with workspace.database.writing(keys_known=True) as connection:
         drop_views(connection)
         older_schema.downgrade(connection, OLDER_SCHEMA)
 

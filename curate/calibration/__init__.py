@@ -1,0 +1,1 @@
+"""Probabilities of labels: a fit to labels with known truth, and what a policy makes of them."""
