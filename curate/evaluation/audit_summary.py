@@ -162,18 +162,19 @@ def _effect_of_evidence(audit: Audit, best: Figures, evidence: Sequence[Figures]
 
 
 def _at_equal_recall(audit: Audit, found: Sequence[Figures]) -> Iterator[str]:
-    """Yield the best policy or evidence at equal weighted recall, and how far it is ahead."""
+    """Yield the best policy or evidence at equal weighted recall, against the reference."""
     defined = [each for each in found if not math.isnan(each.equal_recall_precision.value)]
-    if audit.reference is None or len(defined) < 2:
+    order = sorted(defined, key=lambda each: -each.equal_recall_precision.value)
+    if audit.reference is None or len(order) < 2:
         return
-    recall = audit.whole()[audit.reference].weighted_recall.value
-    best, second = sorted(defined, key=lambda each: -each.equal_recall_precision.value)[:2]
-    compared = audit.compare(best.policy, second.policy)
+    best, reference = order[0], audit.whole()[audit.reference]
+    other = order[1] if best is reference else reference
+    difference = _significance(audit.compare(best.policy, other.policy), "equal_recall_precision")
     yield (
-        f"At the weighted recall of {audit.reference} ({recall:.3f}), {best.policy} has the "
-        f"greatest share of its weight on correct labels: {_percent(best.equal_recall_precision)}. "
-        f"Next is {second.policy} with {100 * second.equal_recall_precision.value:.1f} %; "
-        f"{_significance(compared, 'equal_recall_precision')}."
+        f"At the weighted recall of {reference.policy} ({reference.weighted_recall.value:.3f}), "
+        f"{best.policy} has the greatest share of its weight on correct labels: "
+        f"{_percent(best.equal_recall_precision)}. {other.policy} has "
+        f"{100 * other.equal_recall_precision.value:.1f} %; {difference}."
     )
 
 

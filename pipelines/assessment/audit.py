@@ -5,32 +5,33 @@ and the policies weight them (lambda is computed over these frames only). Only t
 matched to the ground truth.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from sqlalchemy import select
 
-from curate.datasets.base import sequences_of
-from curate.detections import Detections
+from curate.calibration.model import TooFewLabels
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
 from curate.evaluation.counts import describe_others
-from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
-from db import bulk
 from pipelines.assembly import check_executor, describe_score, open_policy, score_meaning
 from pipelines.assessment.audit_folds import open_folds
-from pipelines.assessment.evaluation import match_settings, rectangles_in_image
+from pipelines.assessment.audited_labels import AuditedPart, read_part
+from pipelines.assessment.audited_probabilities import (
+    by_the_round,
+    check_calibration,
+    cross_fitted,
+)
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
-from pipelines.labels.evidence import read_evidence
 from pipelines.round import graph_of, open_plan
 from pipelines.workspace.workspace import Workspace
 
@@ -39,8 +40,11 @@ EVIDENCE: Mapping[str, Callable[[Evidence], np.ndarray]] = {
     "score": lambda evidence: evidence.score,
     "rho_det": lambda evidence: evidence.rho_det,
     "consistency": lambda evidence: np.where(evidence.matched, np.exp(-evidence.loss), 0.0),
+    "probability": lambda evidence: evidence.probability,
 }
 """Evidence to audit like a weight, each in [0, 1]; no training uses it as a weight directly."""
+CALIBRATED = ("learned", "probability")
+"""Names that are audited by default only where there are probabilities."""
 
 ReportCallback = Callable[[Report], None]
 
@@ -53,7 +57,8 @@ class AuditRequest:
         split: "val", or "labeled" for a detector that has not been trained on these frames.
         folds: number of held-out folds of X_l to use instead of a split; 0 for none.
         round_number: e; None for the first round without a student.
-        names: names of policies and of `EVIDENCE`.
+        names: names of policies and of `EVIDENCE`; by default `POLICIES`, `EVIDENCE`, and
+            `CALIBRATED` where there are probabilities.
         overlap: the overlap to match labels by, "bev" or "3d".
         replicates: number of bootstrap draws.
         reference: the name whose weighted recall the others are brought to; None for run.method.
@@ -62,7 +67,7 @@ class AuditRequest:
     split: str = "val"
     folds: int = 0
     round_number: int | None = None
-    names: tuple[str, ...] = (*POLICIES, *EVIDENCE)
+    names: tuple[str, ...] = ()
     overlap: Overlap = "bev"
     replicates: int = 1000
     reference: str | None = None
@@ -73,14 +78,9 @@ class AuditRequest:
         return f"{self.folds} folds" if self.folds else self.split
 
     @property
-    def policies(self) -> tuple[str, ...]:
-        """The names that are policies."""
-        return tuple(name for name in self.names if name not in EVIDENCE)
-
-    @property
-    def evidence(self) -> tuple[str, ...]:
-        """The names that are evidence."""
-        return tuple(name for name in self.names if name in EVIDENCE)
+    def candidates(self) -> tuple[str, ...]:
+        """The names to audit, if they can be."""
+        return self.names or (*POLICIES, "learned", *EVIDENCE)
 
 
 @dataclass(frozen=True)
@@ -89,19 +89,35 @@ class AuditedRound:
 
     Attributes:
         request: see `AuditRequest`.
+        names: the audited names.
         context: the audited round; with folds, the round of the first fold.
         figures: the figures of the audit.
         reports: the reports of the stages.
         unmeasured: the names in the request with weights that could not be measured.
         score_meaning: what a score of the detector estimates; None if unknown.
+        probabilities: a sentence on where probabilities are from; "" without any.
+        missing: why names in `CALIBRATED` were not measured.
     """
 
     request: AuditRequest
+    names: tuple[str, ...]
     context: RoundContext
     figures: Audit
     reports: tuple[Report, ...]
     unmeasured: tuple[str, ...] = ()
     score_meaning: str | None = None
+    probabilities: str = ""
+    missing: str = ""
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """The names that are policies."""
+        return tuple(name for name in self.names if name not in EVIDENCE)
+
+    @property
+    def evidence(self) -> tuple[str, ...]:
+        """The names that are evidence."""
+        return tuple(name for name in self.names if name in EVIDENCE)
 
 
 def run_audit(
@@ -127,34 +143,51 @@ def run_audit(
         reports.append(report)
         on_report(report)
 
-    parts, contexts = [], []
+    parts = []
     for plan, split, done in _audited_splits(workspace, request, progress, record):
+        if split == "val" and not request.folds and {*CALIBRATED} & {*request.names}:
+            check_calibration(workspace, plan.context.number)
         failed = _run_stages(plan, split, progress, done)
-        parts.append(_evaluate(plan, split, request, failed))
-        contexts.append(plan.context)
-    labels = EvaluatedLabels.joined([part for part, _ in parts])
+        parts.append(read_part(plan, split, request.overlap, failed))
+    parts, *probabilities = _with_probabilities(workspace, request, parts)
     weights = {
-        name: np.concatenate([weights[name] for _, weights in parts]) for name in request.names
+        name: np.concatenate([_weights(part, name) for part in parts])
+        for name in request.candidates
     }
+    unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
+    if not request.names:
+        for name in {*CALIBRATED} & {*unmeasured}:
+            del weights[name]
+    context = parts[0].context
     figures = audit(
-        labels,
+        EvaluatedLabels.joined([part.labels for part in parts]),
         weights,
         workspace.config.dataset.categories,
-        np.random.default_rng([workspace.config.run.seed, contexts[0].number]),
+        np.random.default_rng([workspace.config.run.seed, context.number]),
         reference=request.reference or workspace.config.run.method,
         replicates=request.replicates,
     )
-    unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
-    meaning = score_meaning(workspace.config)
-    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured, meaning)
+    return AuditedRound(
+        request,
+        tuple(weights),
+        context,
+        figures,
+        tuple(reports),
+        tuple(name for name in unmeasured if name in weights),
+        score_meaning(workspace.config),
+        *probabilities,
+    )
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
     """Return a summary of the audit in sentences, with its limitations."""
     request = found.request
-    sentences = summary_sentences(found.figures, request.policies, request.evidence)
+    sentences = summary_sentences(found.figures, found.policies, found.evidence)
     without_priors = [name for name in found.unmeasured if name == "rho_det"]
-    without_copies = [name for name in found.unmeasured if name != "rho_det"]
+    without_fit = [name for name in found.unmeasured if name in CALIBRATED]
+    without_copies = [
+        name for name in found.unmeasured if name not in (*without_priors, *without_fit)
+    ]
     if without_copies:
         sentences.append(
             f"Not measured: {', '.join(without_copies)}, because no augmented copy of these frames "
@@ -162,6 +195,10 @@ def describe_audit(found: AuditedRound) -> list[str]:
         )
     if without_priors:
         sentences.append("Not measured: rho_det, because run.priors is empty.")
+    if without_fit:
+        sentences.append(f"Not measured: {', '.join(without_fit)}: {found.missing}.")
+    if {*CALIBRATED} & {*found.names} - {*without_fit}:
+        sentences.append(found.probabilities)
     if not found.figures.counts.counted:
         sentences.append(
             "No object counts: the ground truth of these frames has "
@@ -173,7 +210,7 @@ def describe_audit(found: AuditedRound) -> list[str]:
             f"{request.reference} gives no weight here, so the reference is "
             f"{found.figures.reference or 'missing'}."
         )
-    if "score" in request.names:
+    if "score" in found.names:
         sentences.append(f"The score {describe_score(found.score_meaning)}.")
     if request.split == "labeled" and not request.folds:
         sentences.append(
@@ -191,7 +228,7 @@ def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png")
         f"audit-round-{found.context.number:02d}",
         frames,
         found.request.overlap,
-        *(() if names == AuditRequest.names else names),
+        *names,
     )
     return workspace.root / "reports" / f"{'-'.join(parts)}.{suffix}"
 
@@ -202,12 +239,13 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
         raise ConfigError(
             f"--split {request.split}: use val or labeled; other frames have no ground truth"
         )
-    if request.reference not in (None, *request.names):
+    if request.reference not in (None, *request.candidates):
         raise ConfigError(
-            f"--reference {request.reference}: not audited; use one of {', '.join(request.names)}"
+            f"--reference {request.reference}: not audited; use one of "
+            f"{', '.join(request.candidates)}"
         )
     check_executor(workspace.config)
-    for name in request.policies:
+    for name in {*request.candidates} - {*EVIDENCE}:
         open_policy(workspace.config, name)
     if request.folds:
         if request.round_number not in (None, 1):
@@ -255,86 +293,29 @@ def _run_stages(plan: Plan, split: str, progress: Progress, done: ReportCallback
     return failed
 
 
-def _evaluate(
-    plan: Plan, split: str, request: AuditRequest, failed: set[str]
-) -> tuple[EvaluatedLabels, dict[str, np.ndarray]]:
-    """Return the evaluated labels of a split, and their weights by policy."""
-    workspace, context = plan.workspace, plan.context
-    # Sorted by key, like the evidence.
-    frames = sorted(
-        (key, name) for name, key in workspace.frames(split).items() if name not in failed
-    )
-    complete = plan.complete_frames(plan.graph.round_stage("solve"), split)
-    _, evidence = read_evidence(workspace, context.number, complete)
-    repredicted = _is_repredicted(workspace, context.number, complete)
-    labels = evaluate_frames(
-        _frames(workspace, context, split, frames, complete),
-        match_settings(workspace.config, request.overlap),
-    )
-    return labels, {
-        name: _weights(workspace, name, evidence, context, repredicted=repredicted)
-        for name in request.names
-    }
+def _with_probabilities(
+    workspace: Workspace, request: AuditRequest, parts: list[AuditedPart]
+) -> tuple[list[AuditedPart], str, str]:
+    """Return the labels with probabilities, where those are from, and why some are missing."""
+    policies = {*request.candidates} - {*EVIDENCE}
+    if not {*CALIBRATED} & {*request.candidates}:
+        return parts, "", ""
+    try:
+        if request.folds or request.split == "labeled":
+            generator = np.random.default_rng(workspace.config.run.seed)
+            parts, origin = cross_fitted(workspace, parts, generator)
+            return parts, origin, "solve.learned.max_wrong needs val frames to be audited on"
+        part, origin = by_the_round(parts[0], sorted(policies))
+    except (TooFewLabels, ConfigError, WorkspaceError) as error:
+        return parts, "", str(error)
+    return [part], origin, ""
 
 
-def _weights(
-    workspace: Workspace,
-    name: str,
-    evidence: Evidence,
-    context: RoundContext,
-    *,
-    repredicted: bool,
-) -> np.ndarray:
+def _weights(part: AuditedPart, name: str) -> np.ndarray:
     """Return the weights of a policy, or evidence; NaN if what it rests on was not measured."""
-    unmeasured = np.full(len(evidence), np.nan)
-    if name == "rho_det" and not workspace.config.run.priors:
+    unmeasured = np.full(len(part.evidence), np.nan)
+    if name == "rho_det" and not part.workspace.config.run.priors:
         return unmeasured
-    if name in EVIDENCE:
-        return unmeasured if name == "consistency" and not repredicted else EVIDENCE[name](evidence)
-    policy = open_policy(workspace.config, name)
-    v: np.ndarray = policy.weigh(evidence, context.age).v
-    if repredicted or v.any():
-        return v
-    # Without repredictions, weights of 0 say something only if perfect ones would not change them.
-    consistent = replace(evidence, loss=np.zeros(len(evidence)))
-    return unmeasured if policy.weigh(consistent, context.age).v.any() else v
-
-
-def _is_repredicted(workspace: Workspace, round_number: int, frames: Sequence[int]) -> bool:
-    """Return whether an augmented copy of one of the frames has been predicted."""
-    table = bulk.table("consistency")
-    query = select(table.c.frame_id).where(
-        table.c.round == round_number, table.c.views > 0, table.c.frame_id.in_(frames)
-    )
-    return bool(workspace.database.rows(query.limit(1)))
-
-
-def _frames(
-    workspace: Workspace,
-    context: RoundContext,
-    split: str,
-    frames: Sequence[tuple[int, str]],
-    complete: Sequence[int],
-) -> Iterator[AuditedFrame]:
-    """Yield the frames with their labels; a frame that is not complete has no labels."""
-    labels = workspace.predictions(context.number, complete)
-    points = _points(workspace, context.number)
-    truth = workspace.ground_truth(split)
-    sequences = sequences_of(workspace.dataset, [name for _, name in frames])
-    for key, name in frames:
-        found = labels.get(key, Detections.empty())
-        frame = workspace.dataset.read(name, points=False)
-        yield AuditedFrame(
-            found,
-            truth[name],
-            rectangles_in_image(found.boxes, frame),
-            np.array([points.get((key, k), np.nan) for k in range(len(found))], dtype=np.float64),
-            sequences.get(name, ""),
-        )
-
-
-def _points(workspace: Workspace, round_number: int) -> dict[tuple[int, int], int]:
-    """Return the LiDAR points in each label, by frame key and k."""
-    table = bulk.table("point_prior")
-    query = select(table.c.frame_id, table.c.k, table.c.points).where(table.c.round == round_number)
-    return {(frame, k): points for frame, k, points in workspace.database.rows(query)}
+    if name == "consistency" and not part.repredicted:
+        return unmeasured
+    return EVIDENCE[name](part.evidence) if name in EVIDENCE else part.weights(name)

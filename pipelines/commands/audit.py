@@ -54,8 +54,9 @@ def audit(
     policy: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
-            help="Policy, or a single piece of evidence: score, rho_det or consistency; "
-            "repeatable. Default: pspsl, spsl, threshold, uniform, and all three."
+            help="Policy, or a single piece of evidence: score, rho_det, consistency or "
+            "probability; repeatable. Default: pspsl, spsl, threshold, uniform, all evidence, and "
+            "learned where there are probabilities."
         ),
     ] = None,
     overlap: Annotated[
