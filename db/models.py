@@ -379,7 +379,7 @@ class EvidenceSource(Base):
 
 
 class Calibration(Base):
-    """The fit of a round that turns the evidence of a label into the probability that it is correct.
+    """The fit of a round, which turns the evidence of a label into a probability of being correct.
 
     It is made from the labels of frames with ground truth that the teacher has not been trained on.
     `calibration_label` has the labels that no fit has used, for the bound `max_wrong`.

@@ -15,6 +15,7 @@ from curate.warnings_once import NOTES
 from pipelines.commands.audit import audit
 from pipelines.commands.augment import augment
 from pipelines.commands.bench import bench, bench_cell
+from pipelines.commands.calibrate import calibrate
 from pipelines.commands.check import check
 from pipelines.commands.demo import demo
 from pipelines.commands.diff import diff
@@ -50,6 +51,7 @@ GROUPS: dict[str, tuple[Callable[..., None] | typer.Typer, ...]] = {
         augment,
         repredict,
         score,
+        calibrate,
         solve,
         export,
         train_round,

@@ -20,12 +20,13 @@ from curate.errors import CurateError, WorkspaceError
 from curate.evaluation import kitti_ap
 from curate.evaluation.comparison import known_mean
 from curate.evaluation.kitti_rules import relaxed
-from pipelines.assessment.evaluation import configured_overlaps, detect_val, val_objects
+from pipelines.assessment.evaluation import detect_val, val_objects
 from pipelines.assessment.label_quality import label_quality
 from pipelines.engine.progress import Bar, as_total
 from pipelines.engine.rounds import open_round
 from pipelines.engine.runner import run_round
 from pipelines.engine.schedule import run_all
+from pipelines.labels.matching import configured_overlaps
 from pipelines.reports.terminal import print_report, print_table
 from pipelines.round import graph_of, open_plan
 from pipelines.stages import train_round

@@ -9,6 +9,7 @@ from pipelines.engine.plan import Plan
 from pipelines.engine.rounds import is_pretrained, is_student_trained, open_round
 from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import (
+    calibrate,
     export,
     predict,
     pretrain,
@@ -70,16 +71,30 @@ _DETECT = (
         ready=check_copies,
     ),
 )
-_DECIDE = (
+_JUDGE = (
+    RoundStage(
+        "calibrate",
+        command="calibrate",
+        reads=("ground_truth", "prediction", "consistency"),
+        writes=("calibration",),
+        settings=calibrate.settings,
+        run=calibrate.run,
+        applies=calibrate.applies,
+        truth=calibrate.truth,
+        check_truth=calibrate.check_truth,
+    ),
     RoundStage(
         "solve",
         command="solve",
-        reads=("prediction", "consistency"),
+        reads=("prediction", "consistency", "calibration"),
         writes=("weight",),
         settings=solve.settings,
         run=solve.run,
         check=solve.check,
+        needs=("calibrate",),
     ),
+)
+_TRAIN = (
     RoundStage(
         "export",
         command="export",
@@ -123,9 +138,8 @@ def round_graph(
     ahead = _SEGMENT if maps and score.reads_maps(priors) else ()
     scores = score.stages(priors, [each for stage in ahead for each in stage.writes])
     evidence = tuple(table for stage in scores for table in stage.writes)
-    solve_stage, *others = _DECIDE
-    waiting = replace(solve_stage, reads=(*solve_stage.reads, *evidence))
-    return Graph((*first, *ahead, *_DETECT, *scores, waiting, *others))
+    judging = (replace(stage, reads=(*stage.reads, *evidence)) for stage in _JUDGE)
+    return Graph((*first, *ahead, *_DETECT, *scores, *judging, *_TRAIN))
 
 
 def graph_of(workspace: Workspace) -> Graph:
@@ -138,10 +152,16 @@ def graph_of(workspace: Workspace) -> Graph:
 
 
 def run_graph(workspace: Workspace) -> Graph:
-    """Return the stages that a run of a workspace includes: none that trains, without a trainer."""
-    trained = is_student_trained(workspace)
-    stages = graph_of(workspace).stages
-    return Graph(tuple(each for each in stages if trained or "student" not in each.writes))
+    """Return the stages that a run of a workspace includes, with its trainer and its method."""
+    trained, method = is_student_trained(workspace), workspace.config.run.method
+    return Graph(
+        tuple(
+            stage
+            for stage in graph_of(workspace).stages
+            if (trained or "student" not in stage.writes)
+            and (not isinstance(stage, RoundStage) or stage.is_part(workspace, method))
+        )
+    )
 
 
 def open_plan(

@@ -32,6 +32,7 @@ import numpy as np
 from curate.shapes import Bool, Float, Int
 
 Unit = Literal["frame", "sequence"]
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +91,9 @@ def p_values(
 
 
 def benjamini_hochberg(p: Float[np.ndarray, " m"], max_wrong: float) -> Bool[np.ndarray, " m"]:
-    """Return which labels to select so that about at most a share `max_wrong` of them is wrong."""
+    """Return the labels to select, of which a share of `max_wrong` is expected to be wrong."""
     bounds = _bounds(p)
-    selected = np.flatnonzero(bounds <= max_wrong)
+    selected = np.flatnonzero(bounds <= max_wrong * (1.0 + _ROUNDING))
     if not len(selected):
         return np.zeros(len(p), dtype=bool)
     return np.asarray(p <= np.sort(p)[selected[-1]])

@@ -77,7 +77,7 @@ class Learned(Policy):
 
     def _selected(self, evidence: Evidence, max_wrong: float) -> Weights:
         selected = benjamini_hochberg(evidence.p_value, max_wrong)
-        remark = f"at most {max_wrong:.3g} of them are expected to be wrong"
+        remark = f"at most {max_wrong:g} of those with weight 1 are expected to be wrong"
         if not selected.any():
             remark = (
                 f"max_wrong {max_wrong:g} is out of reach; the least bound that selects a label is "

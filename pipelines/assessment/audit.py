@@ -20,7 +20,6 @@ from curate.evaluation.evaluated_labels import EvaluatedLabels
 from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from pipelines.assembly import check_executor, describe_score, open_policy, score_meaning
-from pipelines.assessment.audit_folds import open_folds
 from pipelines.assessment.audited_labels import AuditedPart, read_part
 from pipelines.assessment.audited_probabilities import (
     by_the_round,
@@ -33,6 +32,7 @@ from pipelines.engine.rounds import is_trainable
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
 from pipelines.round import graph_of, open_plan
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.workspace import Workspace
 
 POLICIES = ("pspsl", "spsl", "threshold", "uniform")

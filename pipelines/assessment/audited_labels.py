@@ -14,11 +14,11 @@ from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
 from db import bulk
 from pipelines.assembly import open_policy
-from pipelines.assessment.evaluation import match_settings, rectangles_in_image
 from pipelines.engine.plan import Plan
 from pipelines.engine.stage import RoundContext
 from pipelines.labels.evidence import LabelKeys, read_evidence
 from pipelines.labels.label_evidence import read_label_evidence
+from pipelines.labels.matching import match_settings, rectangles_in_image
 from pipelines.workspace.workspace import Workspace
 
 

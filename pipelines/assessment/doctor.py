@@ -39,7 +39,7 @@ from pipelines.stages.labeled_copies import (
 )
 from pipelines.stages.predict import checked, visible
 from pipelines.workspace.config import Config
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import HELD_OUT, SPLITS, WITH_TRUTH
 from pipelines.workspace.workspace import Workspace, read_truth
 
 _log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     Raises:
         ConfigError: if no frame of the workspace has that name, or several have.
     """
-    names = list(workspace.frames("unlabeled", "val", "labeled"))
+    names = list(workspace.frames(*SPLITS))
     unlabeled = list(workspace.frames("unlabeled"))
     if not names:
         raise ConfigError(f"doctor: the workspace {workspace.root} has no frames")
@@ -86,7 +86,7 @@ def report_wrong_inputs(workspace: Workspace) -> None:
 
     The detector is left out: results are compared when they are opened, and models take time.
     """
-    name = next(iter(workspace.frames("unlabeled", "val", "labeled")), None)
+    name = next(iter(workspace.frames(*SPLITS)), None)
     if name is None:
         return
     semantic = "semantic" in workspace.config.run.priors
@@ -133,8 +133,8 @@ def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Find
 
 def _labels(workspace: Workspace, frame: Frame) -> Sequence[Finding]:
     """Check the labels of some labeled frames, with those of the frame itself if it has any."""
-    others = [name for name in workspace.frames("labeled", "val") if name != frame.frame_id]
-    own = len(others) < len(workspace.frames("labeled", "val"))
+    others = [name for name in workspace.frames(*WITH_TRUTH) if name != frame.frame_id]
+    own = len(others) < len(workspace.frames(*WITH_TRUTH))
     dataset = workspace.dataset
     frames = [frame] if own else []
     frames += [dataset.read(name) for name in others[: _LABELED_FRAMES - len(frames)]]
@@ -234,7 +234,7 @@ def _other_results(
 ) -> list[tuple[Frame, Detections]]:
     """Return some more frames with recorded results, which cost nothing to compute."""
     found: list[tuple[Frame, Detections]] = []
-    names = (name for name in workspace.frames("unlabeled", "val") if name != frame.frame_id)
+    names = (name for name in workspace.frames("unlabeled", *HELD_OUT) if name != frame.frame_id)
     if not isinstance(detector, RecordedDetector):
         return found
     for name in itertools.islice(names, _RESULT_FRAMES):
@@ -249,7 +249,7 @@ def _other_results(
 
 def _headings(workspace: Workspace, detector: Detector) -> list[Finding]:
     """Compare recorded results of labeled and val frames with the ground truth."""
-    names = list(workspace.frames("labeled", "val"))
+    names = list(workspace.frames(*WITH_TRUTH))
     if not isinstance(detector, RecordedDetector):
         return []
     recorded = sorted({*names} - {*detector.missing_frames(names)})[:_LABELED_FRAMES]

@@ -18,14 +18,12 @@ from curate.errors import FramesFailed, WorkspaceError
 from curate.evaluation.difficulties import Difficulty, open_difficulty
 from curate.evaluation.kitti_ap import UNKNOWN_ALPHA, KittiEvaluation, evaluate
 from curate.evaluation.kitti_matching import objects_in_lidar_frame
-from curate.evaluation.kitti_rules import neighbours_of, overlaps_of
 from curate.evaluation.missing_boxes import (
     ProjectedBoxes,
     describe_placeholder,
     with_projected_boxes,
     without_box,
 )
-from curate.evaluation.reliability import MatchSettings, Overlap
 from curate.frames import Frame
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from curate.geometry.projection import box_rectangles
@@ -36,9 +34,9 @@ from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import choose_round, stored_round
 from pipelines.engine.runner import open_executor
+from pipelines.labels.matching import configured_overlaps
 from pipelines.round import graph_of
 from pipelines.stages.predict import Predict, as_detections
-from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
 
@@ -76,26 +74,6 @@ class ValObjects:
             difficulty=self.difficulty,
             points=self.points,
         )
-
-
-def configured_overlaps(config: Config) -> dict[str, float]:
-    """Return the IoU threshold of each configured category."""
-    return overlaps_of(config.dataset.categories, config.evaluation.overlaps)
-
-
-def match_settings(config: Config, overlap: Overlap) -> MatchSettings:
-    """Return the settings to match labels of the configured categories to ground truth."""
-    categories = config.dataset.categories
-    return MatchSettings(
-        overlap=overlap,
-        minimum_iou=configured_overlaps(config),
-        neighbors={name: (other,) for name, other in neighbours_of(categories).items()},
-    )
-
-
-def rectangles_in_image(boxes: np.ndarray, frame: Frame) -> np.ndarray | None:
-    """Return (n, 4) projected boxes, see `box_rectangles`; None for a frame without an image."""
-    return None if frame.image_size is None else box_rectangles(boxes, frame)
 
 
 def detect_val(

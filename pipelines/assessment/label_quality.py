@@ -17,7 +17,7 @@ from curate.evaluation.reliability import (
     weighted_recall,
 )
 from db import bulk
-from pipelines.assessment.evaluation import match_settings, rectangles_in_image
+from pipelines.labels.matching import match_settings, rectangles_in_image
 from pipelines.workspace.workspace import Workspace, read_truth
 
 

@@ -4,6 +4,7 @@ import logging
 
 from curate.detectors.base import Detector
 from curate.detectors.recorded import RecordedDetector
+from pipelines.workspace.splits import HELD_OUT
 from pipelines.workspace.workspace import Workspace
 
 _log = logging.getLogger(__name__)
@@ -16,14 +17,14 @@ def report_missing_results(workspace: Workspace, detector: Detector | None) -> N
 
 
 def describe_missing_results(workspace: Workspace, detector: Detector | None) -> str:
-    """Return which unlabeled and val frames have no recorded result; "" if all have one.
+    """Return which frames besides the labeled ones have no recorded result; "" if all have one.
 
     Labeled frames need none.
     """
     if not isinstance(detector, RecordedDetector):
         return ""
     parts = []
-    for split in ("unlabeled", "val"):
+    for split in ("unlabeled", *HELD_OUT):
         frames = list(workspace.frames(split))
         if missing := detector.missing_frames(frames):
             shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")

@@ -27,7 +27,7 @@ from pipelines.stages.methods import METHODS
 from pipelines.workspace.config_file import write_config
 from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import SPLITS, count_frames
 from pipelines.workspace.workspace import Workspace
 
 DATABASE = "curate.db"
@@ -58,7 +58,7 @@ def run_job(bench: Bench, job: Job, progress: Metered) -> JobResult:
         ratio=job.ratio,
         seed=job.seed,
         method=job.method,
-        frames={split: len(workspace.frames(split)) for split in SPLITS},
+        frames=count_frames({split: workspace.frames(split) for split in SPLITS}),
         ap=found.ap,
         recall=found.recall,
         thresholds=found.thresholds,

@@ -101,10 +101,10 @@ def audit(
     from curate.viewing.chart_style import check_format
     from curate.viewing.charts import audit_chart
     from pipelines.assessment.audit import AuditRequest, describe_audit, picture_path, run_audit
-    from pipelines.assessment.evaluation import configured_overlaps
     from pipelines.assessment.store import store_audit
     from pipelines.category_names import check_names
     from pipelines.engine.progress import Bar
+    from pipelines.labels.matching import configured_overlaps
 
     kind = check_format(image_format or "png")
     if overlap not in get_args(Overlap):

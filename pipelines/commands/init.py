@@ -9,7 +9,7 @@ from curate.segmenters.classes import CLASS_MAPS
 from pipelines.commands.options import JsonOption, complete, one_of, registered
 from pipelines.registry import DATASETS, DETECTORS, SEGMENTERS, detector_and_preset
 from pipelines.reports.terminal import print_json, print_line
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import SPLITS, count_frames
 
 
 def init(
@@ -35,6 +35,13 @@ def init(
     val: Annotated[
         str,
         typer.Option(help="The same for validation frames; default: the val list of the data set."),
+    ] = "",
+    calibration: Annotated[
+        str,
+        typer.Option(
+            help="Share of the validation frames to set aside for `curate calibrate`, or a file "
+            "with their ids."
+        ),
     ] = "",
     split_by: Annotated[
         str,
@@ -145,19 +152,17 @@ def init(
     if config.train.command is not None:
         check_labels_format(config, frames)
     config = fit_priors(config, frames, explicit=chosen)
-    workspace = initialise(directory, config, labeled, val)
+    workspace = initialise(directory, config, labeled, val, calibration)
     report_missing_results(workspace, supplied)
     report_wrong_inputs(workspace)
     report_images(config, workspace.dataset, list(workspace.frames(*SPLITS)))
-    counts = {split: len(workspace.frames(split)) for split in SPLITS}
+    counts = count_frames({split: workspace.frames(split) for split in SPLITS})
     objects = stored_names(workspace)
     if as_json:
         print_json({"workspace": str(workspace.root), "frames": counts, "objects": objects})
         return
-    print_line(
-        f"{workspace.root}: {counts['labeled']} labeled, {counts['unlabeled']} unlabeled and "
-        f"{counts['val']} val frames; settings in curate.toml"
-    )
+    *first, last = (f"{count} {split}" for split, count in counts.items())
+    print_line(f"{workspace.root}: {', '.join(first)} and {last} frames; settings in curate.toml")
     used = {name: count for name, count in objects.items() if name in config.dataset.categories}
     others = {name: count for name, count in objects.items() if name not in used}
     if objects:

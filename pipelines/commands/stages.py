@@ -10,6 +10,9 @@ from pipelines.commands.options import end, open_workspace
 from pipelines.reports.terminal import print_report
 
 if TYPE_CHECKING:
+    from pipelines.engine.graph import Graph
+    from pipelines.engine.runner import Report
+    from pipelines.engine.stage import RoundStage
     from pipelines.workspace.workspace import Workspace
 
 
@@ -122,7 +125,8 @@ def run_round_command(
     from pipelines.engine.preview import Preview
     from pipelines.engine.progress import Bar
     from pipelines.engine.rounds import open_round, preview_round
-    from pipelines.engine.runner import run_round
+    from pipelines.engine.runner import open_executor, run_round
+    from pipelines.engine.truth import run_truth
     from pipelines.round import graph_of
 
     chosen = policy or workspace.config.run.method
@@ -130,18 +134,53 @@ def run_round_command(
     stage = graph.round_stage(name)
     if stage.check:
         stage.check(workspace, chosen)
+    if stage.truth:
+        _check_truth(workspace, graph, stage, chosen, round_number)
     check_names(workspace)
     if dry_run:
         context = preview_round(workspace, round_number)
         plan = Plan(workspace, context, graph)
         plan.require(stage, chosen)
-        plan.frames_to_weight(stage, chosen)
+        if stage.truth is None:
+            plan.frames_to_weight(stage, chosen)
         preview = Preview(workspace, graph, context.number, context)
-        print_preview([preview.round_stage(stage, chosen)], as_json=as_json)
+        planned = [*preview.truth(stage, chosen), preview.round_stage(stage, chosen)]
+        print_preview(planned, as_json=as_json)
         return
     plan = Plan(workspace, open_round(workspace, round_number), graph)
+    reports: list[Report] = []
+
+    def show(report: "Report") -> None:
+        reports.append(report)
+        if not as_json:
+            print_report(report)
+
+    if stage.truth:
+        with open_executor(workspace) as work:
+            for each in run_truth(plan, stage, chosen, work, Bar()):
+                show(each)
     report = run_round(plan, name, chosen, Bar())
-    report = replace(report, missing=report.missing or missing)
-    if not as_json:
-        print_report(report)
-    end([report], as_json=as_json)
+    show(replace(report, missing=report.missing or missing))
+    end(reports, as_json=as_json)
+
+
+def _check_truth(
+    workspace: "Workspace",
+    graph: "Graph",
+    stage: "RoundStage",
+    policy: str,
+    round_number: int | None,
+) -> None:
+    """Check that a stage has frames with ground truth, and the stages that make their labels."""
+    from curate.errors import ConfigError
+    from pipelines.assembly import check_executor
+    from pipelines.engine.rounds import choose_round
+
+    if not stage.is_part(workspace, policy):
+        raise ConfigError(f"policy {policy} does not need `curate {stage.command}`")
+    check_executor(workspace.config)
+    if stage.check_truth:
+        stage.check_truth(workspace, policy, [choose_round(workspace, round_number, None)[0]])
+    for each in (*graph.first_stages, *graph.before(stage)):
+        if each.check:
+            each.check(workspace)

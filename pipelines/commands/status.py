@@ -22,6 +22,7 @@ def status(
     Example: curate status --failed
     """
     from pipelines.reports.status import decisions, failed_frames, overview
+    from pipelines.workspace.splits import SPLITS, count_frames
 
     opened = open_workspace(workspace)
     if failed:
@@ -35,7 +36,7 @@ def status(
             print_line(f"round {number}  {stage}  {frame} ({split}): {error}", indent=4)
         print_line(f"{len(rows)} failed")
     else:
-        splits = {split: len(opened.frames(split)) for split in ("labeled", "unlabeled", "val")}
+        splits = count_frames({split: opened.frames(split) for split in SPLITS})
         counts = ", ".join(f"{count} {split}" for split, count in splits.items())
         print_table(columns, rows, title=f"{opened.root}: {counts} frames")
         for line in decisions(opened):

@@ -37,7 +37,7 @@ frames are those that one of its readers is going to process, so that nothing is
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -55,18 +55,22 @@ from sqlalchemy import (
 )
 
 from curate.datasets.base import sequences_of
-from curate.errors import WorkspaceError
+from curate.errors import ConfigError, WorkspaceError
 from curate.firewall.sequences import group_by_sequence
 from db import bulk
 from pipelines.assembly import open_policy
 from pipelines.engine.graph import Graph
+from pipelines.engine.rounds import stored_round
 from pipelines.engine.stage import (
     CacheStage,
     FirstStage,
     FramesStage,
     FrameStage,
     RoundContext,
+    RoundJob,
     RoundStage,
+    TruthFrames,
+    TruthSource,
 )
 from pipelines.workspace.workspace import Workspace
 
@@ -183,6 +187,8 @@ class Plan:
                 if isinstance(stage, FirstStage):
                     continue
                 if isinstance(stage, RoundStage):
+                    if not stage.is_part(self.workspace, policy):
+                        continue
                     settings = stage.settings(self.workspace, self.context, policy)
                     prints[stage.name] = _fingerprint(stage.name, settings, stage.reads, inputs)
                 inputs |= dict.fromkeys(stage.results, prints[stage.name])
@@ -307,9 +313,42 @@ class Plan:
                 raise
             return []
 
-    def round_fingerprint(self, stage: RoundStage, policy: str, frames: Sequence[int]) -> str:
+    def job(self, stage: RoundStage, policy: str) -> RoundJob:
+        """Return the input of a round stage.
+
+        Raises:
+            WorkspaceError: if an earlier stage has not processed some of its frames.
+        """
+        if stage.truth is None:
+            return RoundJob(self.context, policy, self.frames_to_weight(stage, policy))
+        sources = stage.truth(self.workspace, self.context, policy, create=False)
+        truth = tuple(self.of_source(source).truth_frames(stage, source) for source in sources)
+        return RoundJob(self.context, policy, (), truth)
+
+    def of_source(self, source: TruthSource) -> "Plan":
+        """Return the plan of the same round for frames with ground truth.
+
+        Raises:
+            WorkspaceError: if their teacher does not exist yet.
+        """
+        context: RoundContext | None = self.context
+        if source.workspace is not self.workspace:
+            context = stored_round(source.workspace, self.context.number)
+        if context is None:
+            raise WorkspaceError(f"{source.workspace.root}: its teacher does not exist yet")
+        return Plan(source.workspace, replace(context, split=source.split), self.graph)
+
+    def truth_frames(self, stage: RoundStage, source: TruthSource) -> TruthFrames:
+        """Return the complete frames of a source, see `complete_frames`."""
+        frames = self.complete_frames(stage, source.split)
+        prints = [self.fingerprint(other) for other in self.graph.before(stage)]
+        return TruthFrames(source, self.context, frames, prints)
+
+    def round_fingerprint(self, stage: RoundStage, job: RoundJob) -> str:
         """Return the fingerprint of a round stage together with the frames that it reads."""
-        return digest([self.fingerprints(policy)[stage.name], list(frames)])
+        truth = [[each.source.title, each.fingerprints, each.frames] for each in job.truth]
+        frames = list(job.frames)
+        return digest([self.fingerprints(job.policy)[stage.name], frames, *truth])
 
     def round_state(self, stage: RoundStage, policy: str) -> str:
         """Return the state of a round stage: "done", "stale", or "waiting" if it never ran."""
@@ -319,10 +358,10 @@ class Plan:
         if not stored:
             return "waiting"
         try:
-            frames = self.frames_to_weight(stage, policy)
-        except WorkspaceError:
+            job = self.job(stage, policy)
+        except (ConfigError, WorkspaceError):
             return "stale"
-        current = self.round_fingerprint(stage, policy, frames)
+        current = self.round_fingerprint(stage, job)
         file = stage.file(self.workspace, self.context, policy) if stage.file else None
         return "done" if stored == [(current,)] and (file is None or file.exists()) else "stale"
 
@@ -334,6 +373,8 @@ class Plan:
         """
         for name in stage.needs:
             other = self.graph.round_stage(name)
+            if not other.is_part(self.workspace, policy):
+                continue
             if self.round_state(other, policy) != "done":
                 number = self.context.number
                 option = "" if policy == self.workspace.config.run.method else f" --policy {policy}"

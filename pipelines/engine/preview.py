@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import func, select
 
 from curate.datasets.base import sequences_of
-from curate.errors import CurateError
+from curate.errors import CurateError, WorkspaceError
 from curate.firewall.sequences import group_by_sequence
 from db import bulk
 from pipelines.engine.executors.machine import usable_cores
@@ -27,6 +27,7 @@ from pipelines.engine.rounds import (
     outside_rounds,
     preview_round,
     recorded_config,
+    stored_round,
 )
 from pipelines.engine.stage import (
     CacheStage,
@@ -93,7 +94,11 @@ def preview_all(workspace: Workspace, graph: Graph, rounds: int | None) -> Itera
             if isinstance(stage, FramesStage):
                 yield preview.frames_stage(stage)
             elif isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
-                planned = preview.round_stage(stage, workspace.config.run.method)
+                method = workspace.config.run.method
+                if not stage.is_part(workspace, method):
+                    continue
+                yield from preview.truth(stage, method)
+                planned = preview.round_stage(stage, method)
                 if planned.reasons and "student" in stage.writes:
                     changing.append(stage.name)
                 yield planned
@@ -181,6 +186,26 @@ class Preview:
             words,
             _seconds(self._workspace, stage, costly, words),
         )
+
+    def truth(self, stage: RoundStage, policy: str) -> Iterator[PlannedStage]:
+        """Yield what a round stage would do with frames that have ground truth.
+
+        Of folds that do not exist yet, nothing is known before their teachers are trained.
+        """
+        if stage.truth is None or self._plan is None:
+            return
+        try:
+            sources = stage.truth(self._workspace, self._plan.context, policy, create=False)
+        except WorkspaceError:
+            return
+        for source in sources:
+            context: RoundContext | None = self._plan.context
+            if source.workspace is not self._workspace:
+                context = stored_round(source.workspace, self._number)
+            preview = Preview(source.workspace, self._graph, self._number, context)
+            for each in self._graph.before(stage):
+                planned = preview.frames_stage(each, source.split)
+                yield replace(planned, stage=f"{planned.stage} {source.title}")
 
     def round_stage(self, stage: RoundStage, policy: str) -> PlannedStage:
         """Return what a round stage would do for a policy."""

@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, exists, select
 
 from curate.errors import WorkspaceError
 from curate.files.batches import batched
@@ -40,7 +40,6 @@ from pipelines.engine.stage import (
     FrameStage,
     Product,
     ReusableMeasurements,
-    RoundJob,
     SequenceStage,
     Stage,
 )
@@ -206,13 +205,13 @@ def run_round(plan: Plan, name: str, policy: str, progress: Progress) -> Report:
         if stage.guard:
             stage.guard(workspace, context, policy)
         plan.require(stage, policy)
-        frames = plan.frames_to_weight(stage, policy)
+        job = plan.job(stage, policy)
         return _run_once(
             workspace,
             TaskKey(context.number, stage.name, policy),
-            plan.round_fingerprint(stage, policy, frames),
+            plan.round_fingerprint(stage, job),
             stage.file(workspace, context, policy) if stage.file else None,
-            lambda: stage.run(workspace, RoundJob(context, policy, frames), progress),
+            lambda: stage.run(workspace, job, progress),
         )
 
 
@@ -440,6 +439,7 @@ class _Writer:
         whole = "prediction" in self.stage.results
         if whole:  # first: the weights, which are deleted below, show which policies are affected
             self._delete_weight_tasks(connection, keys)
+            self._delete_calibration_tasks(connection, keys)
         for table in self.stage.results:
             bulk.delete_frames(connection, table, self.round, keys)
         task = bulk.table("task")
@@ -466,6 +466,14 @@ class _Writer:
         )
         connection.execute(
             count.delete().where(count.c.round == self.round, count.c.policy.in_(policies))
+        )
+
+    def _delete_calibration_tasks(self, connection: Connection, keys: Sequence[int]) -> None:
+        """Delete the calibrations with held-out labels of these frames."""
+        task, label = map(bulk.table, ("task", "calibration_label"))
+        held_out = exists().where(label.c.round == self.round, label.c.frame_id.in_(keys))
+        connection.execute(
+            task.delete().where(task.c.round == self.round, task.c.stage == "calibrate", held_out)
         )
 
     def _task(

@@ -16,6 +16,7 @@ from pipelines.engine.runner import (
     run_round,
 )
 from pipelines.engine.stage import FirstStage, FramesStage, RoundStage
+from pipelines.engine.truth import run_truth
 from pipelines.workspace.workspace import Workspace
 
 
@@ -44,10 +45,10 @@ def run_all(
     """
     trained = train and is_student_trained(workspace)
     policy = workspace.config.run.method
-    check_stages(workspace, graph, policy, evidence=evidence)
+    total = (rounds or workspace.config.run.rounds) if trained else 1
+    check_stages(workspace, graph, policy, evidence=evidence, rounds=total)
     for first in graph.first_stages:
         yield run_first(workspace, first, progress)
-    total = (rounds or workspace.config.run.rounds) if trained else 1
     with open_executor(workspace) as executor:
         for number in range(1, total + 1):
             plan = Plan(workspace, open_round(workspace, number, rounds), graph)
@@ -57,11 +58,23 @@ def run_all(
                 if isinstance(stage, FramesStage) and evidence:
                     yield run_frames(plan, stage, executor, progress)
                 if isinstance(stage, RoundStage) and (trained or "student" not in stage.writes):
+                    if not stage.is_part(workspace, policy):
+                        continue
+                    yield from run_truth(plan, stage, policy, executor, progress)
                     yield run_round(plan, stage.name, policy, progress)
 
 
-def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: bool = True) -> None:
+def check_stages(
+    workspace: Workspace, graph: Graph, policy: str, *, evidence: bool = True, rounds: int = 1
+) -> None:
     """Check the settings of the executor and of all stages before any of them runs.
+
+    Args:
+        workspace: the workspace.
+        graph: the stages.
+        policy: name of the policy.
+        evidence: whether the stages of frames run.
+        rounds: number of rounds that will run.
 
     Raises:
         CurateError: if a setting is wrong.
@@ -70,7 +83,10 @@ def check_stages(workspace: Workspace, graph: Graph, policy: str, *, evidence: b
     for stage in graph.stages:
         if isinstance(stage, FirstStage):
             stage.check(workspace)
-        if isinstance(stage, RoundStage) and stage.check:
-            stage.check(workspace, policy)
+        if isinstance(stage, RoundStage) and stage.is_part(workspace, policy):
+            if stage.check:
+                stage.check(workspace, policy)
+            if stage.check_truth:
+                stage.check_truth(workspace, policy, range(1, rounds + 1))
         if evidence and isinstance(stage, FramesStage) and stage.check:
             stage.check(workspace)

@@ -1,9 +1,9 @@
 """The types of stages. A stage is a named step that reads some tables and writes others."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from sqlalchemy import Connection
 
@@ -61,12 +61,15 @@ class RoundJob:
     Attributes:
         context: the round.
         policy: name of the policy.
-        frames: keys of the unlabeled frames that all earlier stages have finished.
+        frames: keys of the unlabeled frames that all earlier stages have finished; none for a stage
+            that reads frames with ground truth.
+        truth: the frames with ground truth that it reads.
     """
 
     context: RoundContext
     policy: str
     frames: Sequence[int]
+    truth: Sequence["TruthFrames"] = ()
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,12 @@ class Product:
     write: Callable[[Connection], None]
     keys_known: bool = False
     missing: tuple[str, ...] = ()
+
+
+class _TruthSources(Protocol):
+    def __call__(
+        self, workspace: Workspace, context: RoundContext, policy: str, *, create: bool
+    ) -> "Sequence[TruthSource]": ...
 
 
 @dataclass(frozen=True)
@@ -142,6 +151,40 @@ class FirstStage(_Stage):
     file: Callable[[Workspace], Path]
     check: Callable[[Workspace], None]
     guard: Callable[[Workspace], None]
+
+
+@dataclass(frozen=True)
+class TruthSource:
+    """Frames with ground truth whose labels a round stage compares with it.
+
+    Attributes:
+        workspace: where their labels are: the workspace of the round, or a fold inside it.
+        split: their split there.
+        title: what they are, for reports, such as "calibration" or "1/5".
+        first: stages that train the teacher of a fold, after those before the first round.
+    """
+
+    workspace: Workspace
+    split: str
+    title: str
+    first: tuple[FirstStage, ...] = ()
+
+
+@dataclass(frozen=True)
+class TruthFrames:
+    """The frames of a source that all earlier stages have finished.
+
+    Attributes:
+        source: the source.
+        context: the round, with the teacher of the source.
+        frames: keys of the frames, in the workspace of the source.
+        fingerprints: fingerprints of the stages that made their labels.
+    """
+
+    source: TruthSource
+    context: RoundContext
+    frames: Sequence[int]
+    fingerprints: Sequence[str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +270,13 @@ class RoundStage(_Stage):
         guard: check at every start, even if the stage is up to date; raises LeakageError.
         needs: round stages that must be up to date for the same policy before this one runs.
         check: check of its settings before any work; raises an error.
+        applies: function that returns whether the stage is part of a round under a policy; None if
+            it always is.
+        truth: function that returns the frames with ground truth that the stage reads instead of
+            unlabeled frames; None if it reads none. With `create`, folds are created; otherwise it
+            raises WorkspaceError if one is missing.
+        check_truth: check that there are such frames in some rounds, before any work; raises an
+            error.
     """
 
     settings: Callable[[Workspace, RoundContext, str], Settings]
@@ -235,6 +285,13 @@ class RoundStage(_Stage):
     guard: Callable[[Workspace, RoundContext, str], None] | None = None
     needs: tuple[str, ...] = ()
     check: Callable[[Workspace, str], None] | None = None
+    applies: Callable[[Workspace, str], bool] | None = None
+    truth: _TruthSources | None = None
+    check_truth: Callable[[Workspace, str, Iterable[int]], None] | None = None
+
+    def is_part(self, workspace: Workspace, policy: str) -> bool:
+        """Return whether the stage is part of a round under a policy."""
+        return self.applies is None or self.applies(workspace, policy)
 
 
 FramesStage = FrameStage | CacheStage | SequenceStage

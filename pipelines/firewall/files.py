@@ -11,6 +11,7 @@ from curate.firewall.duplicates import HeadHashes, SplitFile, find_duplicates
 from db import bulk
 from pipelines.firewall.finding import Finding
 from pipelines.workspace.split_record import SplitRecord
+from pipelines.workspace.splits import HELD_OUT
 from pipelines.workspace.workspace import Workspace, sha256
 
 _HASHES = "reports/.file-heads.json"
@@ -37,12 +38,15 @@ def label_files(
 
 def _find_problem(found: LabelFileFrames, split_of: Mapping[str, str]) -> str:
     """Describe how a label file contradicts the splits; empty if it does not."""
-    held_out = [name for name in found.splits if split_of.get(name) == "val"]
+    held_out = {
+        split: [name for name in found.splits if split_of.get(name) == split] for split in HELD_OUT
+    }
     unexpected = [name for name in found.splits if name not in split_of]
     moved = [name for name, split in found.splits.items() if split_of.get(name) != split]
     leaked = [name for name in found.truth if split_of.get(name) != "labeled"]
-    if held_out:
-        return f"contains val frames: {named(held_out)}"
+    for split, names in held_out.items():
+        if names:
+            return f"contains {split} frames: {named(names)}"
     if unexpected:
         return f"contains frames that are not in the workspace: {named(unexpected)}"
     if leaked:

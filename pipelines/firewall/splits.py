@@ -5,6 +5,7 @@ from curate.exporters.base import named
 from curate.firewall.sequences import shared_sequences
 from pipelines.firewall.finding import Finding
 from pipelines.workspace.split_record import SplitRecord, changed_lists
+from pipelines.workspace.splits import count_frames
 from pipelines.workspace.workspace import Workspace
 
 
@@ -18,7 +19,7 @@ def recorded_splits(record: SplitRecord) -> Finding:
     elif not record.lists and any(record.splits.values()):
         problem = "the record is missing"
     else:
-        counts = (f"{len(frames)} {split}" for split, frames in record.splits.items())
+        counts = (f"{count} {split}" for split, count in count_frames(record.splits).items())
         return Finding(rule, True, ", ".join(counts))
     remedy = (
         "the database was changed: restore a backup, or create a new workspace with `curate init`"

@@ -12,6 +12,7 @@ from curate.firewall.copied_truth import copied_boxes
 from db import bulk
 from pipelines.firewall.finding import Finding
 from pipelines.workspace.split_record import SplitRecord
+from pipelines.workspace.splits import HELD_OUT, WITH_TRUTH
 from pipelines.workspace.workspace import Workspace
 
 # Frames that are compared with label files before a command, besides those with a score of 1.
@@ -21,7 +22,7 @@ _BATCH = 256
 
 
 def stored_truth(workspace: Workspace) -> Finding:
-    """Check that stored ground truth is of X_l or val, and that X_u has no label paths."""
+    """Check that stored ground truth is not of X_u, and that X_u has no label paths."""
     rule = "no ground truth of X_u is stored"
     truth, frame = bulk.table("ground_truth"), bulk.table("frame")
     rows_of = (
@@ -35,7 +36,7 @@ def stored_truth(workspace: Workspace) -> Finding:
     with workspace.database.reading() as connection:
         rows = bulk.select(connection, rows_of)
         with_path = [row[0] for row in bulk.select(connection, paths)]
-    leaked = [row for row in rows if row[0] not in ("labeled", "val") or row[0] != row[1]]
+    leaked = [row for row in rows if row[0] not in WITH_TRUTH or row[0] != row[1]]
     remedy = (
         "the database was changed: restore a backup, or create a new workspace with `curate init`"
     )
@@ -48,7 +49,12 @@ def stored_truth(workspace: Workspace) -> Finding:
     if with_path:
         return Finding(rule, False, f"label paths are stored for {named(with_path)}", remedy)
     counts = {row[0]: row[2] for row in rows}
-    message = f"{counts.get('labeled', 0)} objects of X_l, {counts.get('val', 0)} of val, 0 of X_u"
+    held_out = "".join(
+        f"{counts.get(split, 0)} of {split}, "
+        for split in HELD_OUT
+        if split == "val" or split in counts
+    )
+    message = f"{counts.get('labeled', 0)} objects of X_l, {held_out}0 of X_u"
     return Finding(rule, True, message)
 
 

@@ -17,6 +17,7 @@ from pipelines.engine.rounds import (
 from pipelines.engine.stage import CacheStage, FirstStage, FramesStage, RoundStage
 from pipelines.labels.human_labels import counts, decided_frames
 from pipelines.round import graph_of
+from pipelines.workspace.splits import WITH_TRUTH
 from pipelines.workspace.workspace import Workspace
 
 COLUMNS = ("round", "stage", "split", "policy", "state", "done", "empty", "failed", "waiting")
@@ -84,7 +85,7 @@ def _first_row(workspace: Workspace, stage: FirstStage) -> tuple[Any, ...]:
 
 
 def _frame_rows(plan: Plan, stage: FramesStage) -> Iterator[tuple[Any, ...]]:
-    for split in ("unlabeled", "val", "labeled"):
+    for split in ("unlabeled", *WITH_TRUTH[::-1]):
         found = plan.counts(stage, split)
         touched = found.done + found.empty + found.failed
         if split != "unlabeled" and not touched:
@@ -103,6 +104,8 @@ def _round_rows(plan: Plan, stage: RoundStage) -> Iterator[tuple[Any, ...]]:
     )
     policies = {row[0] for row in workspace.database.rows(query)}
     for policy in sorted(policies | {workspace.config.run.method}):
+        if not stage.is_part(workspace, policy):
+            continue
         state = plan.round_state(stage, policy)
         done = int(state == "done")
         yield (context.number, stage.name, "", policy, state, done, 0, 0, 1 - done)

@@ -33,6 +33,7 @@ from pipelines.labels.human_labels import fingerprint
 from pipelines.labels.stored_rows import StoredRows
 from pipelines.stages.methods import zero_weight_of
 from pipelines.stages.vanished import check_labels, remember_labels
+from pipelines.workspace.splits import HELD_OUT
 from pipelines.workspace.workspace import Workspace, sha256
 
 CURRENT = "labels.sqlite"
@@ -249,7 +250,7 @@ def _frames(connection: Connection, with_labels: set[str]) -> list[FrameFiles]:
         frame.points_path.label("points"),
         frame.image_path.label("image"),
         frame.calibration_path.label("calibration"),
-    ).where(frame.split != "val")
+    ).where(frame.split.not_in(HELD_OUT))
     rows = sorted(bulk.select(connection, query))
     return [FrameFiles(*row) for row in rows if row[1] == "labeled" or row[0] in with_labels]
 

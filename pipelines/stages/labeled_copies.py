@@ -28,6 +28,7 @@ from curate.geometry.augmented_views import augmented_calibration
 from curate.geometry.mounting import rotations_y_of_yaws, yaws_of_rotations_y
 from curate.geometry.similarity import Similarity
 from pipelines.workspace.config import Config
+from pipelines.workspace.splits import WITH_TRUTH
 from pipelines.workspace.workspace import Workspace, read_truth
 
 TURNED = Similarity(flip_y=True, rotation_rad=0.4, scale=1.03)
@@ -38,7 +39,7 @@ _FRAMES = 12
 
 def labeled_frames(workspace: Workspace) -> tuple[str, ...]:
     """Return the names of some labeled frames, spread over all of them."""
-    names = tuple(workspace.frames("labeled", "val"))
+    names = tuple(workspace.frames(*WITH_TRUTH))
     return names[:: max(1, len(names) // _FRAMES)][:_FRAMES]
 
 

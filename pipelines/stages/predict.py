@@ -50,6 +50,7 @@ Item = TypeVar("Item")
 _WITHOUT_EFFECT = (
     "path",
     "augmented",
+    "unseen",
     "batch_size",
     "workers",
     "timeout_s",

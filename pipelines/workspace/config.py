@@ -224,6 +224,12 @@ class DetectorSection(Section):
         "frames; a relative path starts at the workspace.",
         examples=["copies/{round}-{split}"],
     )
+    unseen: Path | Literal["labeled"] | None = Field(
+        default=None,
+        description="Labeled frames that your own detector has not been trained on, for `curate "
+        "calibrate`: a file with their ids, or 'labeled' for all of them.",
+        examples=["labeled"],
+    )
     device: Annotated[str, KnownDevice()] = Field(
         default="auto",
         description="Where the detector runs and trains: 'cpu', or a device of torch such as "
@@ -421,6 +427,34 @@ class SemanticSection(Section):
         default="expected",
         description="Trust rho_anno of a box that no camera shows: 'expected' is 0.7 s^2, and such "
         "a label never outweighs the best label with image evidence; 'neutral' is s; 'drop' is 0.",
+    )
+
+
+class CalibrateSection(Section):
+    """How the probability that a label is correct is learned from frames with ground truth.
+
+    Policies such as learned need it. The teacher must not have been trained on the frames.
+    """
+
+    source: Literal["auto", "calibration", "labeled", "folds"] = Field(
+        default="auto",
+        description="Frames to learn from: those set aside with `curate init --calibration`; "
+        "labeled frames that your detector has not seen (detector.unseen); or folds of the labeled "
+        "frames, each with a teacher trained on the others. 'auto' takes the first that is "
+        "possible.",
+    )
+    folds: Annotated[int, Field(ge=2)] = Field(
+        default=5,
+        description="Number of folds, each with a training.",
+        json_schema_extra=_unit("folds"),
+    )
+    overlap: Literal["bev", "3d"] = Field(
+        default="bev", description="Overlap with an object that makes a label correct."
+    )
+    thresholds: Literal["kitti", "relaxed"] = Field(
+        default="kitti",
+        description="IoU that it must exceed: those of evaluation.overlaps (0.7 for Car, 0.5 for "
+        "others), or relaxed ones (0.5 and 0.25).",
     )
 
 
@@ -668,6 +702,7 @@ class Config(Section):
     repredict: RepredictSection = RepredictSection()
     points: PointsSection = PointsSection()
     semantic: SemanticSection = SemanticSection()
+    calibrate: CalibrateSection = CalibrateSection()
     solve: SolveSection = SolveSection()
     train: TrainSection = TrainSection()
     run: RunSection = RunSection()

@@ -4,6 +4,7 @@ import logging
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from pipelines import registry
 from pipelines.workspace.config import Config
 from pipelines.workspace.samples import check_samples
 from pipelines.workspace.split_record import split_rows
-from pipelines.workspace.splits import SPLITS
+from pipelines.workspace.splits import SPLITS, WITH_TRUTH
 from pipelines.workspace.workspace import Workspace, open_dataset, with_final_names
 
 _log = logging.getLogger(__name__)
@@ -46,19 +47,26 @@ class Split:
     labeled: tuple[str, ...]
     unlabeled: tuple[str, ...]
     val: tuple[str, ...]
+    calibration: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise LeakageError if two splits share a frame."""
-        for one, other in (("labeled", "unlabeled"), ("labeled", "val"), ("unlabeled", "val")):
+        for one, other in combinations(SPLITS, 2):
             shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
             if shared:
                 raise LeakageError(f"frames in both {one} and {other}: {', '.join(shared[:5])}")
 
 
 def initialise(
-    root: Path, config: Config, labeled: str, val: str, *, compare: bool = True
+    root: Path,
+    config: Config,
+    labeled: str,
+    val: str,
+    calibration: str = "",
+    *,
+    compare: bool = True,
 ) -> Workspace:
-    """Return a workspace with its frames and the ground truth of X_l and val.
+    """Return a workspace with its frames, and their ground truth except that of X_u.
 
     Everything is read before anything is written: a damaged file leaves no incomplete workspace.
 
@@ -67,31 +75,36 @@ def initialise(
         config: its settings.
         labeled: share of the training frames, e.g. "0.04", or a file with a frame name per line.
         val: the same for val frames; "" for the data set's own val list.
+        calibration: share of the val frames that is set aside for calibration, or a file; "" for
+            none.
         compare: whether to compare the names in the label files with `dataset.categories`.
 
     Raises:
         ConfigError: if a share or a list is invalid, a class or file is missing, or the label files
             have no name of `dataset.categories`.
-        DataError: if a label or calibration file of X_l or val is damaged, or has an unknown name.
+        DataError: if a label or calibration file is damaged, or has an unknown name.
         WorkspaceError: if the workspace exists with other frames or settings.
     """
     check_files(config)
     dataset = open_dataset(config)
-    split = choose_split(dataset, labeled, val, config.run.seed, config.dataset.split_by)
-    check_samples(dataset, sorted((*split.labeled, *split.unlabeled, *split.val)))
-    truth = {name: dataset.annotations(name) for name in (*split.labeled, *split.val)}
+    split = choose_split(
+        dataset, labeled, val, config.run.seed, config.dataset.split_by, calibration
+    )
+    check_samples(dataset, sorted(name for each in SPLITS for name in getattr(split, each)))
+    annotated = [name for each in WITH_TRUTH for name in getattr(split, each)]
+    truth = {name: dataset.annotations(name) for name in annotated}
     if compare:
         _compare_names(config, dataset, truth)
     truth = {name: with_final_names(config, found) for name, found in truth.items()}
     workspace = Workspace.create(root, config)
-    stored = Split(*(tuple(workspace.frames(name)) for name in ("labeled", "unlabeled", "val")))
+    stored = Split(*(tuple(workspace.frames(name)) for name in SPLITS))
     if stored == split:
         return workspace
-    if any((stored.labeled, stored.unlabeled, stored.val)):
+    if any(getattr(stored, name) for name in SPLITS):
         raise WorkspaceError(
             f"{workspace.root}: exists with another split of the frames; choose another folder"
         )
-    lists = {"labeled": labeled, "val": val}
+    lists = {"labeled": labeled, "val": val, "calibration": calibration}
     files = {name: Path(each) for name, each in lists.items() if each and Path(each).is_file()}
     _store(workspace, dataset, split, truth, files)
     return workspace
@@ -176,9 +189,14 @@ def check_files(config: Config) -> None:
 
 
 def choose_split(
-    dataset: Dataset, labeled: str, val: str, seed: int, split_by: str = "sequence"
+    dataset: Dataset,
+    labeled: str,
+    val: str,
+    seed: int,
+    split_by: str = "sequence",
+    calibration: str = "",
 ) -> Split:
-    """Choose which frames are labeled, unlabeled and val.
+    """Choose which frames are labeled, unlabeled, val and set aside for calibration.
 
     If the data set has sequences, each goes into one split as a whole, unless `split_by` is
     "frame".
@@ -211,10 +229,16 @@ def choose_split(
         )
     pool = [frame for frame in frames if frame not in set(held_out)]
     chosen = _choose(dataset, pool, labeled, generator, "labeled", sequences)
-    rest = sorted(set(pool) - set(chosen))
-    found = Split(tuple(sorted(chosen)), tuple(rest), tuple(sorted(held_out)))
-    for frame in (*found.labeled, *found.unlabeled, *found.val):
-        check_frame_id(frame)
+    set_aside: Sequence[str] = ()
+    if calibration:
+        # Drawn after the others: those are the same with and without it.
+        set_aside = _choose(dataset, held_out, calibration, generator, "calibration", sequences)
+    rest = set(pool) - set(chosen)
+    kept = set(held_out) - set(set_aside)
+    found = Split(*(tuple(sorted(each)) for each in (chosen, rest, kept, set_aside)))
+    for split in SPLITS:
+        for frame in getattr(found, split):
+            check_frame_id(frame)
     _check_sequences(sequences, found)
     return found
 
@@ -252,10 +276,10 @@ def _choose(
     if share == 0:
         return []
     if not pool:
-        raise ConfigError(
-            f"--{split} {selection}: all frames are val frames already; give --val a share below 1 "
-            "or a file of frame ids"
-        )
+        reason = "all frames are val frames already; give --val a share below 1"
+        if split == "calibration":
+            reason = "it is a share of the val frames, and there are none; give --val a share"
+        raise ConfigError(f"--{split} {selection}: {reason} or a file of frame ids")
     with_label = [name for name in sorted(pool) if dataset.files(name).label]
     count = max(1, round(share * len(pool)))
     if count > len(with_label):
@@ -286,7 +310,8 @@ def _listed(dataset: Dataset, pool: Sequence[str], path: Path, split: str) -> li
         raise ConfigError(f"--{split} {error}") from None
     outside = sorted(set(names) - set(pool))
     if outside:
-        raise ConfigError(f"--{split} {path}: frame {outside[0]} is not among the training frames")
+        among = "val" if split == "calibration" else "training"
+        raise ConfigError(f"--{split} {path}: frame {outside[0]} is not among the {among} frames")
     without_label = [name for name in names if not dataset.files(name).label]
     if without_label:
         raise ConfigError(

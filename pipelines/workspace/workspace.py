@@ -53,7 +53,7 @@ class Workspace:
             ConfigError: if its configuration is invalid.
         """
         root = find_workspace(folder)
-        config = _anchored(root, read_config(root / CONFIG_NAME))
+        config = anchored(root, read_config(root / CONFIG_NAME))
         return cls(root, config, Database(url_of(root, config), root))
 
     @classmethod
@@ -73,8 +73,8 @@ class Workspace:
             write_schema(root)
         else:
             write_config(path, config)
-        anchored = _anchored(root, config)
-        return cls(root, anchored, Database(url_of(root, anchored), root))
+        config = anchored(root, config)
+        return cls(root, config, Database(url_of(root, config), root))
 
     def with_settings(self, section: str, **changes: Any) -> "Workspace":
         """Return the same workspace with other settings in a section, for this command only.
@@ -215,14 +215,15 @@ def stat_fingerprint(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _anchored(root: Path, config: Config) -> Config:
+def anchored(root: Path, config: Config) -> Config:
     """Return the configuration with relative paths resolved against the workspace folder."""
     changes: dict[str, Any] = {}
-    paths = {"dataset": ("root",), "detector": ("path", "augmented"), "segmenter": ("path",)}
+    detector = ("path", "augmented", "unseen")
+    paths = {"dataset": ("root",), "detector": detector, "segmenter": ("path",)}
     for name, keys in paths.items():
         section = getattr(config, name)
         found = {key: getattr(section, key) for key in keys}
-        update = {key: root / path for key, path in found.items() if path is not None}
+        update = {key: root / path for key, path in found.items() if isinstance(path, Path)}
         if update:
             changes[name] = section.model_copy(update=update)
     segmenter = changes.get("segmenter", config.segmenter)

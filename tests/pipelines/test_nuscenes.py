@@ -19,7 +19,7 @@ from support.pipelines_cli import Curate
 from curate.datasets.nuscenes import NuScenesDataset
 from curate.errors import ConfigError, LeakageError
 from curate.geometry.similarity import Similarity
-from pipelines.assessment.audit_folds import open_folds
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.setup import choose_split
 from pipelines.workspace.workspace import Workspace
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import sqlalchemy as sa
 from alembic import op
 
-from db.ddl import deleted_with, integer, key, prediction_key, real, table, text
+from db.ddl import deleted_with, integer, prediction_key, real, table, text
 
 revision = "0012"
 down_revision = "0011"

@@ -24,10 +24,10 @@ from pipelines.assessment.audit import (
     describe_audit,
     run_audit,
 )
-from pipelines.assessment.audit_folds import open_folds
 from pipelines.engine.rounds import open_round
 from pipelines.labels.evidence import read_evidence
 from pipelines.workspace.config import make_config
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
 

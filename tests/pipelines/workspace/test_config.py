@@ -180,9 +180,10 @@ def test_a_written_file_contains_and_explains_every_setting(tmp_path: Path) -> N
     values = tomllib.loads(text)
     for name, setting in SETTINGS.items():
         section, _, key = name.rpartition(".")
+        written = reduce(getitem, section.split("."), values)
         lines = text.partition(f"\n[{section}]\n")[2].partition("\n[")[0].splitlines()
         assert setting.meaning in " ".join(line.removeprefix("# ") for line in lines)
-        assert (key in reduce(getitem, section.split("."), values)) != (f"# {key} = {setting.example}" in lines)
+        assert (key in written) != (f"# {key} = {setting.example}" in lines)
     assert max(map(len, text.splitlines())) <= 100
     assert "\n# Number of rounds E. At least 1, in rounds.\nrounds = 3\n" in text
     assert "or module:Class.\n" in text

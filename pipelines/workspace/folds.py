@@ -2,40 +2,40 @@
 
 The teacher of a fold is trained on the other folds; the fold itself is its val split. If the data
 set has sequences, a fold contains whole sequences. A fold keeps its results, so an interrupted
-audit resumes.
+audit or calibration resumes, and both share the trained teachers.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from curate.datasets.base import sequences_of
-from curate.errors import ConfigError
+from curate.errors import ConfigError, WorkspaceError
 from curate.firewall.sequences import group_by_sequence
 from pipelines.workspace.config import Config, read_config
 from pipelines.workspace.config_file import write_config
 from pipelines.workspace.location import CONFIG_NAME
 from pipelines.workspace.setup import initialise
-from pipelines.workspace.workspace import Workspace
+from pipelines.workspace.workspace import Workspace, anchored
 
 
-def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
+def open_folds(workspace: Workspace, folds: int, option: str = "--folds") -> Iterator[Workspace]:
     """Yield the workspace of every fold; a missing one is created.
+
+    Args:
+        workspace: the workspace.
+        folds: number of folds.
+        option: option or setting with this number, for messages.
 
     Raises:
         ConfigError: if there are fewer labeled frames, or sequences of labeled frames, than folds.
     """
     labeled = sorted(workspace.frames("labeled"))
-    if not 2 <= folds <= len(labeled):
-        raise ConfigError(
-            f"--folds {folds}: {len(labeled)} labeled frames allow 2 to {len(labeled)} folds"
-        )
-    seed = workspace.config.run.seed
-    frames_of_folds = _split_folds(workspace, labeled, folds, np.random.default_rng([seed, folds]))
-    parent = workspace.root / "reports" / "audit" / f"{folds}-folds-seed-{seed}"
-    for fold, held_out in enumerate(frames_of_folds):
-        root = parent / f"fold-{fold + 1}"
+    for root, held_out in zip(
+        _folders(workspace, folds), split_folds(workspace, folds, option), strict=True
+    ):
         root.mkdir(parents=True, exist_ok=True)
         rest = sorted(set(labeled) - set(held_out))
         lists = [
@@ -49,19 +49,47 @@ def open_folds(workspace: Workspace, folds: int) -> Iterator[Workspace]:
         yield initialise(root, config, *map(str, lists), compare=False)
 
 
-def _split_folds(
-    workspace: Workspace, labeled: Sequence[str], folds: int, generator: np.random.Generator
-) -> list[list[str]]:
-    """Split the labeled frames into folds of about the same size, without splitting sequences.
+def existing_folds(workspace: Workspace, folds: int) -> list[Workspace]:
+    """Return the workspaces of the folds, with the current settings; nothing is written.
 
-    Only if there are too few sequences, and the configuration does not require splits by sequence,
-    are frames assigned one by one.
+    Raises:
+        WorkspaceError: if one does not exist yet.
     """
+    config, found = _fold_config(workspace), []
+    for root in _folders(workspace, folds):
+        if not (root / CONFIG_NAME).exists():
+            raise WorkspaceError(f"{root}: the fold does not exist yet")
+        found.append(replace(Workspace.open(root), config=anchored(root, config)))
+    return found
+
+
+def _folders(workspace: Workspace, folds: int) -> list[Path]:
+    name = f"{folds}-folds-seed-{workspace.config.run.seed}"
+    parent = workspace.root / "reports" / "audit" / name
+    return [parent / f"fold-{fold + 1}" for fold in range(folds)]
+
+
+def split_folds(workspace: Workspace, folds: int, option: str = "--folds") -> list[list[str]]:
+    """Return the held-out frames of each fold, of about the same number in each.
+
+    Sequences are not split. Only if there are too few of them, and the configuration does not
+    require splits by sequence, are frames assigned one by one.
+
+    Raises:
+        ConfigError: see `open_folds`.
+    """
+    labeled = sorted(workspace.frames("labeled"))
+    if not 2 <= folds <= len(labeled):
+        allowed = (
+            f"allow 2 to {len(labeled)} folds" if len(labeled) > 1 else "are too few for folds"
+        )
+        raise ConfigError(f"{option} {folds}: {len(labeled)} labeled frames {allowed}")
+    generator = np.random.default_rng([workspace.config.run.seed, folds])
     groups = group_by_sequence(sequences_of(workspace.dataset, labeled), labeled)
     if len(groups) < folds:
         if workspace.config.dataset.split_by == "sequence":
             raise ConfigError(
-                f"--folds {folds}: the labeled frames are from only {len(groups)} sequences, and "
+                f"{option} {folds}: the labeled frames are from only {len(groups)} sequences, and "
                 "a sequence is not split; use fewer folds, or label frames of more sequences"
             )
         groups = {frame: [frame] for frame in labeled}
