@@ -636,7 +636,7 @@ class _Audited:
         primary_key=True,
         sort_order=-1,
         comment="or score, rho_det, consistency: evidence by itself",
-        doc="policy, or score, rho_det, consistency: evidence used as the weight",
+        doc="policy, or score, rho_det, consistency, probability: evidence used as the weight",
     )
     category: Mapped[str] = mapped_column(
         primary_key=True, sort_order=-1, comment="or 'all'", doc="category, or 'all'"
@@ -719,7 +719,7 @@ class Audit(_Audited, _Figures, Base):
     """How well a policy's weights separate correct from wrong labels on frames with ground truth.
 
     The frames are processed as if they were unlabeled. Bounds are those of 95 % confidence
-    intervals, resampled over frames.
+    intervals, resampled over frames, or over sequences if there are any.
     """
 
     __tablename__ = "audit"
