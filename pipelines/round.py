@@ -10,6 +10,7 @@ from pipelines.engine.rounds import is_pretrained, is_student_trained, open_roun
 from pipelines.engine.stage import CacheStage, FirstStage, FrameStage, RoundStage, Stage
 from pipelines.stages import (
     calibrate,
+    calibration_frames,
     export,
     predict,
     pretrain,
@@ -80,8 +81,8 @@ _JUDGE = (
         settings=calibrate.settings,
         run=calibrate.run,
         applies=calibrate.applies,
-        truth=calibrate.truth,
-        check_truth=calibrate.check_truth,
+        truth=calibration_frames.truth,
+        check_truth=calibration_frames.check_truth,
     ),
     RoundStage(
         "solve",

@@ -29,7 +29,8 @@ _COLUMNS = 4
 _READING_AID = (
     "dots: share of correct labels in each tenth of the weight range, at their mean weight; dashed "
     "line: perfect calibration; bars: {level:.0f} % Wilson interval; hollow: fewer than "
-    f"{_FEW_LABELS} labels; below: number of labels, log scale"
+    f"{_FEW_LABELS} labels; below: number of labels, log scale; ECE: calibration error, and what "
+    "perfectly calibrated weights would have; precision: share of the weight on correct labels"
 )
 # Okabe and Ito's colours, which colour-blind readers can distinguish, each with its own marker.
 _LINES = (
@@ -232,8 +233,8 @@ def _write_figures(axes: "Axes", figures: Figures) -> None:
     error, limit = _format(figures.calibration_error), _number(figures.calibration_error_limit)
     precision, equal = map(_format, (figures.weighted_precision, figures.equal_recall_precision))
     lines = (
-        f"AUROC {_format(figures.auroc)}   calibration error {error} (chance: {limit})",
-        f"weight on correct labels {precision}, at equal recall {equal}",
+        f"AUROC {_format(figures.auroc)}   ECE {error}, by chance up to {limit}",
+        f"precision {precision}, at equal recall {equal}",
     )
     axes.annotate(
         "\n".join(lines), (0, 1), (0, 5), xycoords="axes fraction", textcoords="offset points",

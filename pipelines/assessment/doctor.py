@@ -30,8 +30,15 @@ from pipelines.assembly import (
 from pipelines.assessment.missing_results import describe_missing_results
 from pipelines.category_names import detector_differences, find_differences
 from pipelines.devices import detector_place, idle_gpu, segmenter_place
-from pipelines.engine.rounds import choose_round, is_trainable, newest_checkpoint
+from pipelines.engine.rounds import (
+    choose_round,
+    is_student_trained,
+    is_trainable,
+    newest_checkpoint,
+)
 from pipelines.labels.of_one_frame import find_frame
+from pipelines.stages import calibrate
+from pipelines.stages.calibration_frames import check_truth, choose_source
 from pipelines.stages.labeled_copies import (
     TURNED,
     examine_labeled_copies,
@@ -76,6 +83,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
+    findings += _guarded("calibration", lambda: _calibration(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     return name, findings
@@ -95,6 +103,7 @@ def report_wrong_inputs(workspace: Workspace) -> None:
     except CurateError:
         return  # the frames that cannot be read are reported by their own check
     findings = [*_guarded("labels", lambda: _labels(workspace, frame))]
+    findings += _guarded("calibration", lambda: _calibration(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     for finding in findings:
@@ -121,6 +130,22 @@ def _training(config: Config) -> Sequence[Finding]:
     """Check the settings of curate's trainer; there is nothing to report if they are valid."""
     check_training_options(config)
     return []
+
+
+def _calibration(workspace: Workspace) -> Sequence[Finding]:
+    """Check that the method has frames to learn probabilities from, if it reads any."""
+    method = workspace.config.run.method
+    if not calibrate.applies(workspace, method):
+        return []
+    number, rounds = choose_round(workspace, None, None)
+    last = rounds if is_student_trained(workspace) else number
+    check_truth(workspace, method, range(number, last + 1))
+    source = choose_source(workspace, number)
+    frames = len(workspace.frames("labeled" if source == "folds" else source))
+    of = (
+        f"{source} of {frames} labeled frames" if source == "folds" else f"{frames} {source} frames"
+    )
+    return [Finding("calibration", "ok", f"probabilities are learned from {of}")]
 
 
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:

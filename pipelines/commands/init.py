@@ -68,6 +68,13 @@ def init(
         Optional[Path],  # noqa: UP045
         typer.Option(help="Checkpoint, model file or results of an external detector."),
     ] = None,
+    unseen: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Labeled frames that an external detector was not trained on, for `curate "
+            "calibrate`: a file with their ids, or 'labeled' for all."
+        ),
+    ] = None,
     detector_config: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="Model file (YAML) of a checkpoint of OpenPCDet."),
@@ -131,6 +138,7 @@ def init(
         "detector": {
             "name": detector,
             "path": detector_path and detector_path.resolve(),
+            "unseen": _unseen(unseen),
             "options": _model_file(detector, detector_path, detector_config),
         },
         "segmenter": {
@@ -168,6 +176,18 @@ def init(
     if objects:
         tail = f"; not in dataset.categories: {listed(others)}" if others else ""
         print_line(f"objects in the label files: {listed(used)}{tail}")
+
+
+def _unseen(text: str | None) -> Path | str | None:
+    """Return the value of --unseen: the word, or the path of a file."""
+    from curate.errors import ConfigError
+
+    if text in {None, "labeled"}:
+        return text
+    path = Path(str(text))
+    if not path.is_file():
+        raise ConfigError(f"--unseen {text}: no such file; give a file of frame ids, or labeled")
+    return path.resolve()
 
 
 def _model_file(detector: str, path: Path | None, config: Path | None) -> dict[str, str]:

@@ -195,6 +195,13 @@ class Plan:
             self._by_policy[policy] = prints
         return self._by_policy[policy]
 
+    def renew(self, policy: str) -> None:
+        """Compute the fingerprints of a policy anew, because settings may depend on a new result.
+
+        For example, those of solve contain the fingerprint of the calibration.
+        """
+        self._by_policy.pop(policy, None)
+
     def round_of(self, stage: FramesStage) -> int:
         """Return the round of a stage's tasks: 0 for a stage that depends on no round."""
         return 0 if isinstance(stage, CacheStage) else self.context.number

@@ -206,13 +206,15 @@ def run_round(plan: Plan, name: str, policy: str, progress: Progress) -> Report:
             stage.guard(workspace, context, policy)
         plan.require(stage, policy)
         job = plan.job(stage, policy)
-        return _run_once(
+        report = _run_once(
             workspace,
             TaskKey(context.number, stage.name, policy),
             plan.round_fingerprint(stage, job),
             stage.file(workspace, context, policy) if stage.file else None,
             lambda: stage.run(workspace, job, progress),
         )
+        plan.renew(policy)
+        return report
 
 
 def run_first(workspace: Workspace, stage: FirstStage, progress: Progress) -> Report:

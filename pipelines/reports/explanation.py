@@ -26,6 +26,13 @@ from pipelines.assembly import (
 from pipelines.labels.by_frame import check_weights, weighted_round
 from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
+from pipelines.reports.probability import (
+    ExplainedProbability,
+    explain_probability,
+    fallback_line,
+    probability_lines,
+    rule_of,
+)
 from pipelines.review.decisions import describe_decision
 from pipelines.stages.methods import ZERO_WEIGHT_WORDS, zero_weight_of
 from pipelines.workspace.config import Config, make_config
@@ -86,7 +93,7 @@ class Recomputed:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A row of `weighted_labels`, the views of its loss, the recomputed weight, and text lines."""
+    """A row of `weighted_labels`, the numbers behind its weight, the weight again, and lines."""
 
     label: dict[str, Any]
     views: tuple[View, ...]
@@ -94,6 +101,7 @@ class Explanation:
     evidence: Recomputed
     recomputed: float | None
     lines: tuple[str, ...]
+    probability: ExplainedProbability | None = None
 
     def as_text(self) -> str:
         """Return the explanation as text."""
@@ -133,16 +141,25 @@ def _computed(workspace: Workspace, label: dict[str, Any]) -> Explanation:
     frame, k = label["frame"], label["k"]
     views = _views(workspace, label["round"], frame, k)
     config = _stored_config(workspace, label["round"])
-    age = _age(workspace, config, label) if label["lambda_u"] is not None else None
+    rule = rule_of(config, label)
+    age = _age(workspace, config, label, rule) if label["lambda_u"] is not None else None
     evidence = _evidence(config, label, views)
-    priors_only = not views and not _self_paced(config, label["policy"])
-    recomputed = _weight(label, evidence, age, priors_only=priors_only)
-    limit = _limit(workspace, config, label, recomputed)
-    lines = _lines(config, label, views, age, evidence, recomputed, limit)
+    probability = explain_probability(workspace, config, label)
+    priors_only = not views and not _self_paced(config, rule)
+    recomputed = _weight(rule, evidence, age, priors_only=priors_only)
+    if probability is not None:
+        recomputed = probability.weight
+    limit = _limit(workspace, config, label, recomputed, rule)
+    lines = _evidence_lines(config, label, views, evidence)
+    if probability is not None:
+        lines += probability_lines(probability, config.dataset.categories, label["category"])
+    elif rule != label["policy"]:
+        lines.append(fallback_line(workspace, label))
+    lines += _weight_lines(config, label, rule, age, evidence, recomputed, limit, probability)
     meaning = workspace.config.detector.score_meaning or score_meaning(config)
     lines.insert(1, f"  score          {describe_score(meaning)}")
     recomputed = recomputed if limit is None else limit
-    return Explanation(label, views, age, evidence, recomputed, tuple(lines))
+    return Explanation(label, views, age, evidence, recomputed, tuple(lines), probability)
 
 
 def _label(
@@ -207,9 +224,11 @@ def _views(workspace: Workspace, round_number: int, frame: str, k: int) -> tuple
         return tuple(View(row[0], bool(row[1]), *row[2:]) for row in rows)
 
 
-def _age(workspace: Workspace, config: Config, label: dict[str, Any]) -> AgeParameter | None:
+def _age(
+    workspace: Workspace, config: Config, label: dict[str, Any], rule: str
+) -> AgeParameter | None:
     """Return the terms of Eq. 4 over the losses that share the label's lambda; None without any."""
-    scope, quantile = _schedule(config, label["policy"])
+    scope, quantile = _schedule(config, rule)
     number = bulk.table("round")
     query = _losses(label, scope)
     rounds = select(number.c.rounds).where(number.c.number == label["round"])
@@ -312,29 +331,33 @@ def _self_paced(config: Config, policy: str) -> bool:
 
 
 def _weight(
-    label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None, *, priors_only: bool
+    rule: str, evidence: Recomputed, age: AgeParameter | None, *, priors_only: bool
 ) -> float | None:
     """Return the weight by Eqs. 7 and 11; None for policies that do not use them.
 
     The weight is rho_det if the policy does not use lambda (solve.self_paced = false), or if there
     is no second pass (`priors_only`).
     """
-    if label["policy"] not in {"spsl", "pspsl"}:
+    if rule not in {"spsl", "pspsl"}:
         return None
     if evidence.loss is None:
         return evidence.rho_det if priors_only else 0.0
     if age is None:
         return evidence.rho_det
     v = float(easiness(np.array([evidence.loss]), np.array([age.lambda_u]))[0])
-    return v * (evidence.rho_det if label["policy"] == "pspsl" else 1.0)
+    return v * (evidence.rho_det if rule == "pspsl" else 1.0)
 
 
 def _limit(
-    workspace: Workspace, config: Config, label: dict[str, Any], recomputed: float | None
+    workspace: Workspace,
+    config: Config,
+    label: dict[str, Any],
+    recomputed: float | None,
+    rule: str,
 ) -> float | None:
     """Return the weight of the best label with image evidence, if it limits this label's weight."""
     applies = label["box_pixels"] == 0 and config.semantic.outside == "expected"
-    if not applies or label["policy"] != "pspsl" or not recomputed:
+    if not applies or rule != "pspsl" or not recomputed:
         return None
     weight, prior = bulk.table("weight"), bulk.table("semantic_prior")
     same = and_(*(weight.c[key] == prior.c[key] for key in ("round", "frame_id", "k")))
@@ -346,15 +369,10 @@ def _limit(
     return float(best) if best and best < recomputed else None
 
 
-def _lines(
-    config: Config,
-    label: dict[str, Any],
-    views: tuple[View, ...],
-    age: AgeParameter | None,
-    evidence: Recomputed,
-    recomputed: float | None,
-    limit: float | None,
+def _evidence_lines(
+    config: Config, label: dict[str, Any], views: tuple[View, ...], evidence: Recomputed
 ) -> list[str]:
+    """Return the lines that show the evidence of a label."""
     number = _numbers(label)
     section = config.repredict
     lines = _head(number)
@@ -371,15 +389,35 @@ def _lines(
             lines.append(f"  {source.declaration.name:<14} {description}")
     factors = [f"{name} {value:.4f}" for name, value in evidence.rho.items() if value is not None]
     lines.append(f"  priors         rho_det = {' * '.join(factors) or '1'} = {number['rho_det']}")
-    lines.append(_age_line(config, label["policy"], age, str(number["lambda_u"])))
+    return lines
+
+
+def _weight_lines(
+    config: Config,
+    label: dict[str, Any],
+    rule: str,
+    age: AgeParameter | None,
+    evidence: Recomputed,
+    recomputed: float | None,
+    limit: float | None,
+    probability: ExplainedProbability | None,
+) -> list[str]:
+    """Return the lines that show how the weight follows from the evidence."""
+    number = _numbers(label)
+    lines = []
+    if probability is None:
+        lines.append(_age_line(config, rule, age, str(number["lambda_u"])))
     formulas = {"spsl": "1 - L / lambda, Eq. 7", "pspsl": "rho_det (1 - L / lambda), Eq. 11"}
-    if label["lambda_u"] is None and not _self_paced(config, label["policy"]):
+    if label["lambda_u"] is None and not _self_paced(config, rule):
         formulas["pspsl"] = "rho_det, without the self-paced term"
-    formula = formulas.get(label["policy"], "see curate solve --help")
+    formula = formulas.get(rule, "see curate solve --help")
+    if probability is not None and probability.formula:
+        formula = probability.formula
     lines.append(f"  policy         {label['policy']}: v = {formula}")
     lines.append(f"  weight         {number['weight']}{_meaning(config, label)}")
     if recomputed is not None:
-        lines.append(f"  recomputed     {_working(label, evidence, age)}{recomputed:.4f}")
+        working = "" if probability else _working(rule, evidence, age)
+        lines.append(f"  recomputed     {working}{recomputed:.4f}")
         if limit is not None:
             lines.append(
                 f"  limited        to {limit:.4f}, the weight of the best label with image evidence"
@@ -440,14 +478,14 @@ def _age_line(config: Config, policy: str, age: AgeParameter | None, stored: str
     )
 
 
-def _working(label: dict[str, Any], evidence: Recomputed, age: AgeParameter | None) -> str:
+def _working(rule: str, evidence: Recomputed, age: AgeParameter | None) -> str:
     """Return the equation of the weight with its values; empty if nothing is to be computed."""
     if age is None or evidence.loss is None:
         return ""
     if evidence.loss >= age.lambda_u > 0:
         return f"L {evidence.loss:.4f} is not below lambda {age.lambda_u:.4f}: "
     ease = f"1 - {evidence.loss:.4f} / {age.lambda_u:.4f}"
-    return f"{evidence.rho_det:.4f} * ({ease}) = " if label["policy"] == "pspsl" else f"{ease} = "
+    return f"{evidence.rho_det:.4f} * ({ease}) = " if rule == "pspsl" else f"{ease} = "
 
 
 def _view_line(view: View) -> str:

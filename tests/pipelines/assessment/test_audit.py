@@ -16,7 +16,7 @@ from curate.errors import ConfigError, FramesFailed, LeakageError, WorkspaceErro
 from curate.evaluation.audit import COMPARED
 from curate.geometry.overlap import bev_iou
 from db import bulk
-from pipelines.assessment import audited_probabilities
+from pipelines.assessment import audited_labels, audited_probabilities
 from pipelines.assessment.audit import (
     EVIDENCE,
     POLICIES,
@@ -304,6 +304,21 @@ def test_the_command_stores_and_names_differences(curate: Curate, workspace: Wor
         assert row["verdict"] == ("real" if real else "may be chance")
     reference = json.loads(curate("query", REFERENCE, "--json", "-w", workspace.root)[1])
     assert reference == [{"reference": "spsl", "power": 1.0, "same": 1}]
+
+
+def test_frames_of_a_sequence_are_drawn_together(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four val frames of two drives: too few to distinguish a difference from chance."""
+
+    def drives(_dataset, frames):
+        return {name: f"drive {i // 2}" for i, name in enumerate(sorted(frames))}
+
+    monkeypatch.setattr(audited_labels, "sequences_of", drives)
+    found, _ = audit(workspace)
+    assert (found.figures.sequences, found.figures.resampled) == (2, "2 sequences")
+    assert not any(each.beyond_chance for each in found.figures.comparisons)
+    assert "every difference may be chance" in " ".join(describe_audit(found))
 
 
 @pytest.fixture

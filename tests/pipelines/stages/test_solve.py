@@ -59,7 +59,7 @@ def test_solving_again_at_another_age_gives_the_rows_of_a_first_solve(
 @pytest.mark.parametrize("statement", [
     "DELETE FROM weight WHERE policy = 'pspsl' AND frame_id = 4 AND k = 17",
     "UPDATE weight SET k = 1000 WHERE policy = 'pspsl' AND frame_id = 4 AND k = 17",
-    "INSERT INTO weight SELECT round, frame_id, 999 + k, policy, lambda_u, rho_det, v, v FROM weight",
+    "INSERT INTO weight SELECT round, frame_id, 1000 + k, policy, 0, rho_det, v, v FROM weight",
 ])  # fmt: skip
 def test_manually_changed_weights_are_replaced(workspace: Workspace, statement: str) -> None:
     """Missing or extra rows do not shift the values of others."""
