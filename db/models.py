@@ -713,7 +713,7 @@ class _Audited:
         primary_key=True,
         sort_order=-1,
         comment="or score, rho_det, consistency: evidence by itself",
-        doc="policy, or score, rho_det, consistency: evidence used as the weight",
+        doc="policy, or score, rho_det, consistency, probability: evidence used as the weight",
     )
     category: Mapped[str] = mapped_column(
         primary_key=True, sort_order=-1, comment="or 'all'", doc="category, or 'all'"
@@ -769,13 +769,34 @@ class _Figures:
     )
     calibration_error_low: Mapped[Bound]
     calibration_error_high: Mapped[Bound]
+    calibration_error_by_chance: Mapped[float | None] = mapped_column(
+        sort_order=1, doc="mean calibration error of perfectly calibrated weights on these labels"
+    )
+    calibration_error_limit: Mapped[float | None] = mapped_column(
+        sort_order=1,
+        doc="calibration error that 95 % of perfectly calibrated weights do not exceed",
+    )
+    reference: Mapped[str | None] = mapped_column(
+        sort_order=1,
+        doc="policy with the weighted recall of equal_recall_precision; null = no weight is given",
+    )
+    equal_recall_power: Mapped[float | None] = mapped_column(
+        sort_order=1,
+        doc="power of the weights that gives the weighted recall of the reference; null = none, or "
+        "infinite",
+    )
+    equal_recall_precision: Mapped[float | None] = mapped_column(
+        sort_order=1, doc="weighted precision of the weights to that power"
+    )
+    equal_recall_precision_low: Mapped[Bound] = mapped_column(sort_order=1)
+    equal_recall_precision_high: Mapped[Bound] = mapped_column(sort_order=1)
 
 
 class Audit(_Audited, _Figures, Base):
     """How well a policy's weights separate correct from wrong labels on frames with ground truth.
 
     The frames are processed as if they were unlabeled. Bounds are those of 95 % confidence
-    intervals, resampled over frames.
+    intervals, resampled over frames, or over sequences if there are any.
     """
 
     __tablename__ = "audit"
@@ -798,6 +819,27 @@ class AuditSlice(_Audited, _Figures, Base):
         comment="metres or points, not included; null = open",
         doc="upper bound in metres or points, exclusive; null = unbounded",
     )
+
+
+class AuditDifference(_Audited, Base):
+    """The difference between a figure of two policies in an audit: that of `policy` - of `other`.
+
+    Bounds are those of a 95 % confidence interval over the same draws of frames, or of sequences.
+    """
+
+    __tablename__ = "audit_difference"
+    __table_args__ = ({"sqlite_with_rowid": False},)
+
+    other: Mapped[str] = mapped_column(primary_key=True, doc="the policy that is subtracted")
+    figure: Mapped[str] = mapped_column(
+        primary_key=True,
+        doc="column of audit: auroc | average_precision | equal_recall_precision | "
+        "calibration_error",
+    )
+    difference: Mapped[float] = mapped_column(doc="figure of policy - figure of other")
+    low: Mapped[Bound]
+    high: Mapped[Bound]
+    real: Mapped[int] = mapped_column(doc="1 = the interval excludes 0; 0 = it may be chance")
 
 
 class AuditBin(_Audited, Base):

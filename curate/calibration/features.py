@@ -83,6 +83,16 @@ class LabelEvidence:
             **self.further,
         }
 
+    @classmethod
+    def joined(cls, parts: Sequence["LabelEvidence"]) -> "LabelEvidence":
+        """Return the labels of all parts, which have the same further columns."""
+        columns = {
+            name: np.concatenate([part.columns()[name] for part in parts])
+            for name in parts[0].columns()
+        }
+        further = {name: columns.pop(name) for name in parts[0].further}
+        return cls(**columns, further=further)
+
     def select(self, rows: np.ndarray) -> "LabelEvidence":
         """Return the labels at `rows` (integers or a mask), in that order."""
         further = {name: column[rows] for name, column in self.further.items()}

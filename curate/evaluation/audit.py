@@ -3,8 +3,9 @@
 The labels of these frames are made and weighted as if the frames were unlabeled. The ground truth
 then shows how many are correct, and how well the weights of each policy separate correct labels
 from wrong ones: overall, by category, by distance from the LiDAR, and by LiDAR points in the box.
-Intervals come from a bootstrap over frames, because frames are what was sampled. Policies are
-compared on the same draws.
+Intervals come from a bootstrap over frames, because frames are what was sampled; if the data set
+has sequences, over sequences, because frames of one sequence are alike. Policies are compared on
+the same draws.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,20 +14,27 @@ from typing import Self
 
 import numpy as np
 
+from curate.evaluation.audit_sample import Resampling, Sample, measure
 from curate.evaluation.counts import Counts
 from curate.evaluation.evaluated_labels import ALL, WHOLE, EvaluatedLabels, Slice, slices
 from curate.evaluation.reliability import (
     ReliabilityBins,
-    auroc,
-    average_precision,
-    expected_calibration_error,
+    chance_calibration_errors,
     rank_labels,
     reliability_bins,
-    weighted_precision,
-    weighted_recall,
 )
-from curate.evaluation.resampling import draw_frames, ranked_replicates
+from curate.evaluation.resampling import draw_frames
 from curate.shapes import Float
+
+COMPARED = ("auroc", "average_precision", "equal_recall_precision", "calibration_error")
+"""The figures of `Figures` by which policies are compared."""
+
+FEWEST_SEQUENCES = 6
+"""Below this number of sequences, every difference may be chance.
+
+If two policies are equally good, all of k sequences favour the same one with probability 2 / 2^k:
+6 % for five sequences, 3 % for six.
+"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,14 @@ class Figures:
         average_precision: average precision of the labels ranked by weight.
         weighted_precision: share of the weight that is on correct labels.
         weighted_recall: weight on correct labels per object.
+        equal_recall_precision: weighted precision of the weights to the power `equal_recall_power`.
+        equal_recall_power: power at which the weights have the same weighted recall as those of
+            `Audit.reference` in the same category and slice; NaN if there is none.
         calibration_error: expected difference between the weight and the share of correct labels.
+        calibration_error_by_chance: mean calibration error of perfectly calibrated weights, for
+            these labels and weights.
+        calibration_error_limit: the calibration error that perfectly calibrated weights exceed with
+            a probability of 1 - `Audit.level`.
         bins: labels, precision and recall by weight.
     """
 
@@ -87,23 +102,64 @@ class Figures:
     average_precision: Estimate
     weighted_precision: Estimate
     weighted_recall: Estimate
+    equal_recall_precision: Estimate
+    equal_recall_power: float
     calibration_error: Estimate
+    calibration_error_by_chance: float
+    calibration_error_limit: float
     bins: ReliabilityBins
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the calibration error is no larger than chance explains."""
+        return self.calibration_error.value <= self.calibration_error_limit
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The difference between the AUROC of two policies on the same frames: policy - other."""
+    """The differences between the figures of two policies on the same frames: policy - other.
+
+    Attributes:
+        category: the category, or `ALL`.
+        policy: the first policy.
+        other: the policy whose figures are subtracted.
+        differences: the difference by figure, for the figures in `COMPARED`.
+        conclusive: False if too few sequences were drawn to distinguish a difference from chance.
+    """
 
     category: str
     policy: str
     other: str
-    difference: Estimate
+    differences: Mapping[str, Estimate]
+    conclusive: bool = True
+
+    @property
+    def difference(self) -> Estimate:
+        """The difference of the AUROC."""
+        return self.differences["auroc"]
 
     @property
     def beyond_chance(self) -> bool:
-        """Whether the interval of the difference excludes 0."""
-        return self.difference.low > 0 or self.difference.high < 0
+        """Whether the interval of the difference of the AUROC excludes 0."""
+        return self.is_real("auroc")
+
+    def is_real(self, figure: str) -> bool:
+        """Return whether the interval of a difference excludes 0; if not, it may be chance."""
+        found = self.differences[figure]
+        return self.conclusive and (found.low > 0 or found.high < 0)
+
+    def negated(self) -> "Comparison":
+        """Return the comparison of the same policies in the other order."""
+        return Comparison(
+            self.category,
+            self.other,
+            self.policy,
+            {
+                name: Estimate(-found.value, -found.high, -found.low)
+                for name, found in self.differences.items()
+            },
+            self.conclusive,
+        )
 
 
 @dataclass(frozen=True)
@@ -117,6 +173,10 @@ class Audit:
         label_counts: the same for the labels.
         figures: the figures by category, slice and policy.
         comparisons: the comparison of every two policies, by category.
+        sequences: number of sequences of the frames, which were resampled unless there is only one;
+            None if the frames are not in sequences.
+        reference: the policy with the weighted recall at which weights are compared; None if no
+            weights can be.
     """
 
     frames: int
@@ -125,6 +185,20 @@ class Audit:
     label_counts: Counts
     figures: tuple[Figures, ...]
     comparisons: tuple[Comparison, ...]
+    sequences: int | None = None
+    reference: str | None = None
+
+    @property
+    def resampled(self) -> str:
+        """What the intervals are computed over, such as "25 frames"."""
+        if self.sequences in (None, 1):
+            return f"{self.frames} frames"
+        return f"{self.sequences} sequences"
+
+    @property
+    def conclusive(self) -> bool:
+        """Whether the frames are of enough sequences to distinguish a difference from chance."""
+        return self.sequences is None or self.sequences >= FEWEST_SEQUENCES
 
     def whole(self, category: str = ALL) -> dict[str, Figures]:
         """Return the figures over all distances and point counts, by policy."""
@@ -139,9 +213,7 @@ class Audit:
         for found in self.comparisons:
             if (found.category, found.policy, found.other) == (category, policy, other):
                 return found
-        found = self.compare(other, policy, category)
-        negated = Estimate(-found.difference.value, -found.difference.high, -found.difference.low)
-        return Comparison(category, policy, other, negated)
+        return self.compare(other, policy, category).negated()
 
 
 def audit(
@@ -150,6 +222,7 @@ def audit(
     categories: Sequence[str],
     generator: np.random.Generator,
     *,
+    reference: str | None = None,
     replicates: int = 1000,
     level: float = 0.95,
     bins: int = 10,
@@ -161,130 +234,79 @@ def audit(
         weights: (n,) weights in [0, 1], by policy; all NaN if they could not be measured.
         categories: the categories to audit, each by itself and all together.
         generator: random generator for the bootstrap.
+        reference: the policy with the weighted recall at which weights are compared. By default, or
+            if it gives no weight, the first policy that gives any.
         replicates: number of bootstrap draws.
         level: coverage of the intervals.
         bins: number of bins of the weight.
     """
-    draws = draw_frames(generator, labels.frames, replicates)
+    unit = labels.resampling_unit
+    units = int(unit.max(initial=-1)) + 1
+    sequences = units if units < labels.frames else None
+    if sequences == 1:
+        unit, units = np.arange(labels.frames), labels.frames
+    resampling = Resampling(draw_frames(generator, units, replicates), unit, bins)
+    seed = int(generator.integers(2**32))
+    reference = _usable_reference(weights, reference)
+    conclusive = sequences is None or sequences >= FEWEST_SEQUENCES
     figures: list[Figures] = []
     comparisons: list[Comparison] = []
     for category in (ALL, *categories):
         for part in (WHOLE, *slices(labels)):
-            sample = _sample(labels, category, part)
-            aurocs: dict[str, np.ndarray] = {}
-            for policy, policy_weights in weights.items():
-                found, aurocs[policy] = _figures(policy, policy_weights, sample, draws, level, bins)
+            sample = Sample.of(labels, category, part, resampling, weights.get(reference or ""))
+            replicated: dict[str, Mapping[str, np.ndarray]] = {}
+            for policy, v in weights.items():
+                of_chance = np.random.default_rng(seed)  # the same whatever else is audited
+                found, replicated[policy] = _figures(policy, v, sample, level, of_chance)
                 figures.append(found)
             if part == WHOLE:
-                comparisons += _comparisons(figures[-len(weights) :], aurocs, level)
+                comparisons += _comparisons(
+                    figures[-len(weights) :], replicated, level, conclusive=conclusive
+                )
     counts = labels.counts(categories)
-    return Audit(labels.frames, level, *counts, tuple(figures), tuple(comparisons))
-
-
-@dataclass(frozen=True)
-class _Sample:
-    """The counted labels of a category and slice; `objects` is (f,) per frame, or None."""
-
-    category: str
-    part: Slice
-    index: np.ndarray
-    frame_index: np.ndarray
-    correct: np.ndarray
-    neutral: int
-    objects: np.ndarray | None
-
-
-def _sample(labels: EvaluatedLabels, category: str, part: Slice) -> _Sample:
-    of_category = np.full(len(labels), True) if category == ALL else labels.category == category
-    objects = np.full(len(labels.object_frame), True)
-    if category != ALL:
-        objects = labels.object_category == category
-    if part.by != "all":
-        of_category &= part.holds(getattr(labels, part.by))
-        objects &= part.holds(labels.object_distance)
-    index = np.flatnonzero(of_category & labels.counted)
-    return _Sample(
-        category,
-        part,
-        index,
-        labels.frame_index[index],
-        labels.correct[index],
-        int((of_category & ~labels.counted).sum()),
-        # Points are counted inside labels only, so the point counts of objects are unknown.
-        None
-        if part.by == "points"
-        else np.bincount(labels.object_frame[objects], minlength=labels.frames),
+    return Audit(
+        labels.frames, level, *counts, tuple(figures), tuple(comparisons), sequences, reference
     )
+
+
+def _usable_reference(weights: Mapping[str, np.ndarray], wanted: str | None) -> str | None:
+    """Return the wanted policy if it gives weight, else the first that does; None without any."""
+    usable = [name for name, v in weights.items() if rank_labels(v)]
+    return wanted if wanted in usable else next(iter(usable), None)
 
 
 def _figures(
-    policy: str,
-    weights: np.ndarray,
-    sample: _Sample,
-    draws: np.ndarray,
-    level: float,
-    bins: int,
-) -> tuple[Figures, np.ndarray]:
-    """Return the figures of one policy, and the replicates of its AUROC."""
-    v, correct = weights[sample.index], sample.correct
-    frames = draws.shape[1]
-    objects = 0 if sample.objects is None else int(sample.objects.sum())
-    values, ranked = _ranked(v, sample, draws)
-    counts, found, weight, trusted = (
-        draws @ np.bincount(sample.frame_index, column, minlength=frames)
-        for column in (np.ones(len(v)), correct, v, v * correct)
-    )
-    of_objects = draws @ (np.zeros(frames) if sample.objects is None else sample.objects)
-    error = _calibration_replicates(v, sample, draws, bins) / np.where(counts, counts, np.nan)
-
-    def estimate(value: float, replicates: np.ndarray) -> Estimate:
-        return Estimate.of(value, replicates, level)
-
+    policy: str, weights: np.ndarray, sample: Sample, level: float, generator: np.random.Generator
+) -> tuple[Figures, Mapping[str, np.ndarray]]:
+    """Return the figures of one policy, and their replicates by name."""
+    v, bins = weights[sample.index], sample.resampling.bins
+    values, replicates, power = measure(v, sample)
+    by_chance = chance_calibration_errors(v, generator, bins=bins)
+    estimates = {
+        name: Estimate.of(value, replicates[name], level) for name, value in values.items()
+    }
     return Figures(
         policy=policy,
         category=sample.category,
         slice=sample.part,
         labels=len(v),
         neutral=sample.neutral,
-        right=int(correct.sum()),
-        objects=None if sample.objects is None else objects,
-        share_right=estimate(_mean(correct), _ratio(found, counts)),
-        auroc=estimate(values[0], ranked[0]),
-        average_precision=estimate(values[1], ranked[1]),
-        weighted_precision=estimate(weighted_precision(v, correct), _ratio(trusted, weight)),
-        weighted_recall=estimate(weighted_recall(v, correct, objects), _ratio(trusted, of_objects)),
-        calibration_error=estimate(expected_calibration_error(v, correct, bins), error),
-        bins=reliability_bins(v, correct, objects, bins),
-    ), ranked[0]
-
-
-def _ranked(
-    v: np.ndarray, sample: _Sample, draws: np.ndarray
-) -> tuple[tuple[float, float], tuple[np.ndarray, np.ndarray]]:
-    """Return AUROC and average precision, and their replicates; NaN if the weights rank nothing."""
-    if not rank_labels(v):
-        undefined = np.full(len(draws), np.nan)
-        return (np.nan, np.nan), (undefined, undefined)
-    values = auroc(v, sample.correct), average_precision(v, sample.correct)
-    return values, ranked_replicates(v, sample.correct, sample.frame_index, draws)
-
-
-def _calibration_replicates(
-    v: np.ndarray, sample: _Sample, draws: np.ndarray, bins: int
-) -> np.ndarray:
-    """Return (r,) the calibration error times the number of labels.
-
-    This is the sum over the bins of |correct labels - sum of weights|.
-    """
-    edges = np.arange(bins + 1) / bins
-    member = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1)
-    cell = sample.frame_index * bins + member
-    gap = np.bincount(cell, sample.correct - v, minlength=draws.shape[1] * bins)
-    return np.asarray(np.abs(draws @ gap.reshape(-1, bins)).sum(axis=1))
+        right=int(sample.correct.sum()),
+        objects=sample.objects,
+        **estimates,
+        equal_recall_power=power,
+        calibration_error_by_chance=float(by_chance.mean()),
+        calibration_error_limit=float(np.quantile(by_chance, level)),
+        bins=reliability_bins(v, sample.correct, sample.objects or 0, bins),
+    ), replicates
 
 
 def _comparisons(
-    figures: Sequence[Figures], aurocs: Mapping[str, np.ndarray], level: float
+    figures: Sequence[Figures],
+    replicated: Mapping[str, Mapping[str, np.ndarray]],
+    level: float,
+    *,
+    conclusive: bool,
 ) -> list[Comparison]:
     """Compare every policy with each policy after it."""
     return [
@@ -292,21 +314,16 @@ def _comparisons(
             one.category,
             one.policy,
             other.policy,
-            Estimate.of(
-                one.auroc.value - other.auroc.value,
-                aurocs[one.policy] - aurocs[other.policy],
-                level,
-            ),
+            {
+                name: Estimate.of(
+                    getattr(one, name).value - getattr(other, name).value,
+                    replicated[one.policy][name] - replicated[other.policy][name],
+                    level,
+                )
+                for name in COMPARED
+            },
+            conclusive,
         )
         for i, one in enumerate(figures)
         for other in figures[i + 1 :]
     ]
-
-
-def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Return (r,) part / whole, NaN if the whole is 0."""
-    return np.asarray(part / np.where(whole > 0, whole, np.nan))
-
-
-def _mean(correct: np.ndarray) -> float:
-    return float(correct.mean()) if len(correct) else float("nan")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from curate.evaluation.audit import Audit, Comparison, Estimate, Figures
+from curate.evaluation.audit import FEWEST_SEQUENCES, Audit, Comparison, Estimate, Figures
 from curate.evaluation.evaluated_labels import ALL
 
 FEW_FRAMES = 30
@@ -31,6 +31,8 @@ def summary_sentences(audit: Audit, policies: Sequence[str], evidence: Sequence[
         return [*sentences, *_undefined_auroc(some)]
     sentences += _best_policy(audit, ranked)
     sentences += _effect_of_evidence(audit, ranked[0], _by_auroc(by_policy, evidence))
+    everything = [by_policy[name] for name in (*policies, *evidence)]
+    sentences += [*_at_equal_recall(audit, everything), *_calibration(everything)]
     return [*sentences, *_weight_by_correctness([by_policy[name] for name in policies])]
 
 
@@ -38,13 +40,27 @@ def as_numbers(audit: Audit) -> dict[str, Any]:
     """Return plain numbers for JSON; None for an undefined figure or an open upper edge."""
     return {
         "frames": audit.frames,
+        "sequences": audit.sequences,
+        "reference": audit.reference,
         "level": audit.level,
         "counts": {"objects": audit.counts.as_dict(), "labels": audit.label_counts.as_dict()},
         "figures": [as_plain(_flat(found)) for found in audit.figures],
-        "comparisons": [
-            as_plain({**asdict(found), "beyond_chance": found.beyond_chance})
-            for found in audit.comparisons
-        ],
+        "comparisons": [as_plain(_compared(found)) for found in audit.comparisons],
+    }
+
+
+def _compared(found: Comparison) -> dict[str, Any]:
+    """Return a comparison as a dictionary, with what is real among its differences."""
+    return {
+        "category": found.category,
+        "policy": found.policy,
+        "other": found.other,
+        "difference": asdict(found.difference),
+        "beyond_chance": found.beyond_chance,
+        "differences": {
+            name: {**asdict(difference), "beyond_chance": found.is_real(name)}
+            for name, difference in found.differences.items()
+        },
     }
 
 
@@ -66,7 +82,8 @@ def _flat(found: Figures) -> dict[str, Any]:
             strict=True,
         )
     ]
-    return {**asdict(found), "bins": rows}
+    undefined = math.isnan(found.calibration_error.value)
+    return {**asdict(found), "calibrated": None if undefined else found.calibrated, "bins": rows}
 
 
 def as_plain(value: Any) -> Any:
@@ -102,10 +119,16 @@ def _caveats(audit: Audit, some: Figures) -> Iterator[str]:
             f"{some.neutral} more are neither correct nor wrong, because they lie on an object of "
             "a neighbour category (Van, Person_sitting) or in a DontCare region."
         )
-    if some.labels and audit.frames < FEW_FRAMES:
+    count, units = audit.resampled.split()
+    if some.labels and int(count) < FEW_FRAMES:
         yield (
-            f"With {audit.frames} frames the intervals are only approximate; "
-            f"use {FEW_FRAMES} frames or more."
+            f"With {count} {units} the intervals are only approximate; "
+            f"use {FEW_FRAMES} {units} or more."
+        )
+    if some.labels and not audit.conclusive:
+        yield (
+            f"Frames of one sequence are alike, and there are fewer than {FEWEST_SEQUENCES} "
+            f"sequences ({audit.sequences}): every difference may be chance."
         )
 
 
@@ -138,6 +161,38 @@ def _effect_of_evidence(audit: Audit, best: Figures, evidence: Sequence[Figures]
         )
 
 
+def _at_equal_recall(audit: Audit, found: Sequence[Figures]) -> Iterator[str]:
+    """Yield the best policy or evidence at equal weighted recall, against the reference."""
+    defined = [each for each in found if not math.isnan(each.equal_recall_precision.value)]
+    order = sorted(defined, key=lambda each: -each.equal_recall_precision.value)
+    if audit.reference is None or len(order) < 2:
+        return
+    best, reference = order[0], audit.whole()[audit.reference]
+    other = order[1] if best is reference else reference
+    difference = _significance(audit.compare(best.policy, other.policy), "equal_recall_precision")
+    yield (
+        f"At the weighted recall of {reference.policy} ({reference.weighted_recall.value:.3f}), "
+        f"{best.policy} has the greatest share of its weight on correct labels: "
+        f"{_percent(best.equal_recall_precision)}. {other.policy} has "
+        f"{100 * other.equal_recall_precision.value:.1f} %; {difference}."
+    )
+
+
+def _calibration(found: Sequence[Figures]) -> Iterator[str]:
+    """Yield which weights are probabilities as far as these labels can show."""
+    defined = [each for each in found if not math.isnan(each.calibration_error.value)]
+    beyond = [each.policy for each in defined if not each.calibrated]
+    for each in defined:
+        if each.calibrated:
+            yield (
+                f"The calibration error of {each.policy}, {each.calibration_error.value:.3f}, may "
+                "be chance: that of perfectly calibrated weights would be "
+                f"{each.calibration_error_by_chance:.3f}, up to {each.calibration_error_limit:.3f}."
+            )
+    if beyond:
+        yield f"The calibration error is larger than chance explains for {', '.join(beyond)}."
+
+
 def _weight_by_correctness(policies: Sequence[Figures]) -> Iterator[str]:
     defined = [found for found in policies if not math.isnan(found.weighted_precision.value)]
     order = sorted(defined, key=lambda found: -found.weighted_precision.value)
@@ -153,13 +208,11 @@ def _weight_by_correctness(policies: Sequence[Figures]) -> Iterator[str]:
     )
 
 
-def _significance(found: Comparison) -> str:
-    interval = (
-        f"{found.difference.value:.3f} ({found.difference.low:.3f} to {found.difference.high:.3f})"
-    )
-    if found.beyond_chance:
-        return f"the difference of {interval} is significant"
-    return f"the difference of {interval} is not significant on these frames"
+def _significance(found: Comparison, figure: str = "auroc") -> str:
+    interval = f"the difference of {_figure(found.differences[figure])}"
+    if found.is_real(figure):
+        return f"{interval} is significant"
+    return f"{interval} is not significant on these frames and may be chance"
 
 
 def _by_auroc(by_policy: dict[str, Figures], names: Sequence[str]) -> list[Figures]:

@@ -1,7 +1,7 @@
 """The labels of frames with ground truth, each marked as correct, wrong or neutral."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import Self
 
@@ -33,12 +33,14 @@ class AuditedFrame:
         rectangles: (n, 4) left, top, right, bottom of the labels in the image, in pixels; NaN for
             labels outside the image. None for a frame without an image.
         points: (n,) LiDAR points in each label, NaN where they were not counted.
+        sequence: name of the frame's sequence; "" if it is in none.
     """
 
     labels: Detections
     truth: Annotations
     rectangles: Float[np.ndarray, "n 4"] | None
     points: Float[np.ndarray, " n"]
+    sequence: str = ""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class EvaluatedLabels:
         object_distance: (m,) metres on the ground.
         other_category: (o,) str, the annotations that are not evaluated: other categories,
             neighbours, and DontCare regions.
+        sequence: (f,) str name of the sequence of each frame, "" for a frame in none. By default
+            no frame is in a sequence.
     """
 
     frames: int
@@ -73,6 +77,20 @@ class EvaluatedLabels:
     object_category: Shaped[np.ndarray, " m"]
     object_distance: Float[np.ndarray, " m"]
     other_category: Shaped[np.ndarray, " o"]
+    sequence: Shaped[np.ndarray, " f"] = field(default_factory=lambda: as_categories([]))
+
+    def __post_init__(self) -> None:
+        """Set the default of `sequence`."""
+        if len(self.sequence) == 0:
+            object.__setattr__(self, "sequence", as_categories([""] * self.frames))
+
+    @property
+    def resampling_unit(self) -> Int[np.ndarray, " f"]:
+        """(f,) int64 number of the unit of each frame: its sequence, or the frame itself."""
+        numbers: dict[str | int, int] = {}
+        names = [name or frame for frame, name in enumerate(self.sequence.tolist())]
+        unit = [numbers.setdefault(name, len(numbers)) for name in names]
+        return np.array(unit, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -90,9 +108,9 @@ class EvaluatedLabels:
             for part, start in zip(parts, starts[:-1], strict=True)
         ]
         columns = {
-            field.name: np.concatenate([getattr(part, field.name) for part in numbered])
-            for field in fields(cls)
-            if field.name != "frames"
+            column.name: np.concatenate([getattr(part, column.name) for part in numbered])
+            for column in fields(cls)
+            if column.name != "frames"
         }
         return cls(int(starts[-1]), **columns)
 
@@ -188,4 +206,5 @@ def _evaluate_frame(frame: AuditedFrame, settings: MatchSettings) -> EvaluatedLa
         object_category=as_categories(frame.truth.categories[objects]),
         object_distance=np.hypot(*frame.truth.boxes[objects, :2].T),
         other_category=as_categories(frame.truth.categories[~objects]),
+        sequence=as_categories([frame.sequence]),
     )

@@ -217,14 +217,12 @@ def reliability_bins(
     measured = ~np.isnan(weights)
     if not measured.all():
         weights, correct, ground_truths = weights[measured], correct[measured], 0
-    # Unlike np.linspace, this gives the floats nearest to 0.1, 0.2, 0.3.
-    edges = np.arange(bins + 1) / bins
-    member = np.clip(np.searchsorted(edges, weights, side="right") - 1, 0, bins - 1)
+    member = bin_of(weights, bins)
     labels = np.bincount(member, minlength=bins)
     found = np.bincount(member[correct], minlength=bins)
     with np.errstate(invalid="ignore", divide="ignore"):
         return ReliabilityBins(
-            edges=edges,
+            edges=np.arange(bins + 1) / bins,
             labels=labels,
             mean_weight=np.bincount(member, weights=weights, minlength=bins) / labels,
             precision=found / labels,
@@ -241,6 +239,49 @@ def expected_calibration_error(
     table = reliability_bins(weights, correct, 0, bins)
     gap = np.abs(table.precision - table.mean_weight)
     return _ratio(float(np.nansum(gap * table.labels)), float(table.labels.sum()))
+
+
+def chance_calibration_errors(
+    weights: Float[np.ndarray, " n"],
+    generator: np.random.Generator,
+    simulations: int = 1000,
+    bins: int = 10,
+) -> Float[np.ndarray, " s"]:
+    """Return calibration errors that perfectly calibrated weights would have by chance alone.
+
+    Label i is then correct with probability v_i, independently of the others. The error is not 0,
+    because few labels in a bin are hardly ever correct in exactly the share of their mean weight.
+    The number of correct labels in a bin is a sum of Bernoulli variables, and is drawn from the
+    binomial distribution with the same mean and the same variance.
+
+    Args:
+        weights: (n,) in [0, 1]; NaN if they were not measured.
+        generator: random generator of the simulations.
+        simulations: number of simulations, s.
+        bins: as in `expected_calibration_error`.
+
+    Returns:
+        (s,) calibration errors, NaN without labels or if weights were not measured.
+    """
+    if not len(weights) or np.isnan(weights).any():
+        return np.full(simulations, np.nan)
+    member = bin_of(weights, bins)
+    mean = np.bincount(member, weights, minlength=bins)
+    squares = np.bincount(member, weights**2, minlength=bins)
+    # mean = m q and variance = mean - squares = m q (1 - q) of m trials with probability q.
+    some = mean > 0
+    trials = np.zeros(bins, dtype=np.int64)
+    trials[some] = np.ceil(np.round(mean[some] ** 2 / squares[some], 6))
+    share = np.divide(mean, trials, out=np.zeros(bins), where=some)
+    drawn = generator.binomial(trials, np.minimum(share, 1.0), (simulations, bins))
+    return np.asarray(np.abs(drawn - mean).sum(axis=1) / len(weights))
+
+
+def bin_of(weights: Float[np.ndarray, " n"], bins: int) -> Int[np.ndarray, " n"]:
+    """Return the bin of each weight; see `reliability_bins`."""
+    # Unlike np.linspace, this gives the floats nearest to 0.1, 0.2, 0.3.
+    edges = np.arange(bins + 1) / bins
+    return np.clip(np.searchsorted(edges, weights, side="right") - 1, 0, bins - 1)
 
 
 def _minimum_iou(settings: MatchSettings, category: str) -> float:

@@ -29,7 +29,8 @@ _COLUMNS = 4
 _READING_AID = (
     "dots: share of correct labels in each tenth of the weight range, at their mean weight; dashed "
     "line: perfect calibration; bars: {level:.0f} % Wilson interval; hollow: fewer than "
-    f"{_FEW_LABELS} labels; below: number of labels, log scale"
+    f"{_FEW_LABELS} labels; below: number of labels, log scale; ECE: calibration error, and what "
+    "perfectly calibrated weights would have; precision: share of the weight on correct labels"
 )
 # Okabe and Ito's colours, which colour-blind readers can distinguish, each with its own marker.
 _LINES = (
@@ -163,7 +164,7 @@ def audit_chart(audit: Audit, title: str) -> Chart:
                 next(cells), (bins.mean_weight, bins.precision, bins.labels), audit.level
             )
             _write_figures(axes, each)
-        _draw_aurocs(next(cells).add_subplot(), found, audit.level)
+        _draw_aurocs(next(cells).add_subplot(), found, audit.level, audit.resampled)
     return Chart("audit", title, figure)
 
 
@@ -229,9 +230,11 @@ def _draw_reliability(
 def _write_figures(axes: "Axes", figures: Figures) -> None:
     """Write a policy's name and figures above its panel."""
     axes.set_title(figures.policy, pad=26)
+    error, limit = _format(figures.calibration_error), _number(figures.calibration_error_limit)
+    precision, equal = map(_format, (figures.weighted_precision, figures.equal_recall_precision))
     lines = (
-        f"AUROC {_format(figures.auroc)}   calibration error {_format(figures.calibration_error)}",
-        f"weight on correct labels {_format(figures.weighted_precision)}",
+        f"AUROC {_format(figures.auroc)}   ECE {error}, by chance up to {limit}",
+        f"precision {precision}, at equal recall {equal}",
     )
     axes.annotate(
         "\n".join(lines), (0, 1), (0, 5), xycoords="axes fraction", textcoords="offset points",
@@ -239,11 +242,11 @@ def _write_figures(axes: "Axes", figures: Figures) -> None:
     )  # fmt: skip
 
 
-def _draw_aurocs(axes: "Axes", found: Sequence[Figures], level: float) -> None:
+def _draw_aurocs(axes: "Axes", found: Sequence[Figures], level: float, over: str) -> None:
     """Draw the AUROC of each policy with its interval, the best on top."""
     axes.set_title("AUROC", pad=26)
     axes.annotate(
-        f"correct ranked above wrong labels\nbars: {100 * level:.0f} % interval, by frames",
+        f"correct ranked above wrong labels\nbars: {100 * level:.0f} % interval over {over}",
         (0, 1), (0, 5), xycoords="axes fraction", textcoords="offset points", fontsize=7.5,
         color=FAINT,
     )  # fmt: skip
@@ -325,7 +328,11 @@ def _wrapped(text: str, width: int) -> str:
 
 
 def _format(estimate: Estimate) -> str:
-    return "-" if np.isnan(estimate.value) else f"{estimate.value:.2f}"
+    return _number(estimate.value)
+
+
+def _number(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.2f}"
 
 
 def _short_count(labels: int) -> str:

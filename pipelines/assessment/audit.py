@@ -11,26 +11,28 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from sqlalchemy import select
 
-from curate.detections import Detections
+from curate.calibration.model import TooFewLabels
 from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.audit import Audit, audit
 from curate.evaluation.audit_summary import summary_sentences
 from curate.evaluation.counts import describe_others
-from curate.evaluation.evaluated_labels import AuditedFrame, EvaluatedLabels, evaluate_frames
+from curate.evaluation.evaluated_labels import EvaluatedLabels
 from curate.evaluation.fusion_effect import FusionEffect, fusion_effects
 from curate.evaluation.reliability import Overlap
 from curate.weighting.base import Evidence
-from db import bulk
 from pipelines.assembly import check_executor, describe_score, open_policy, score_meaning
+from pipelines.assessment.audited_labels import AuditedPart, before_and_after, read_part
+from pipelines.assessment.audited_probabilities import (
+    by_the_round,
+    check_calibration,
+    cross_fitted,
+)
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
 from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
 from pipelines.engine.stage import RoundContext
-from pipelines.labels.evidence import read_evidence
-from pipelines.labels.matching import match_settings, rectangles_in_image
 from pipelines.round import graph_of, open_plan
 from pipelines.workspace.folds import open_folds
 from pipelines.workspace.workspace import Workspace
@@ -40,8 +42,11 @@ EVIDENCE: Mapping[str, Callable[[Evidence], np.ndarray]] = {
     "score": lambda evidence: evidence.score,
     "rho_det": lambda evidence: evidence.rho_det,
     "consistency": lambda evidence: np.where(evidence.matched, np.exp(-evidence.loss), 0.0),
+    "probability": lambda evidence: evidence.probability,
 }
 """Evidence to audit like a weight, each in [0, 1]; no training uses it as a weight directly."""
+CALIBRATED = ("learned", "probability")
+"""Names that are audited by default only where there are probabilities."""
 
 ReportCallback = Callable[[Report], None]
 
@@ -54,22 +59,59 @@ class AuditRequest:
         split: "val", or "labeled" for a detector that has not been trained on these frames.
         folds: number of held-out folds of X_l to use instead of a split; 0 for none.
         round_number: e; None for the first round without a student.
-        names: names of policies and of `EVIDENCE`.
+        names: names of policies and of `EVIDENCE`; by default `POLICIES`, `EVIDENCE`, and
+            `CALIBRATED` where there are probabilities.
         overlap: the overlap to match labels by, "bev" or "3d".
         replicates: number of bootstrap draws.
+        reference: the name whose weighted recall the others are brought to; None for run.method.
     """
 
     split: str = "val"
     folds: int = 0
     round_number: int | None = None
-    names: tuple[str, ...] = (*POLICIES, *EVIDENCE)
+    names: tuple[str, ...] = ()
     overlap: Overlap = "bev"
     replicates: int = 1000
+    reference: str | None = None
 
     @property
     def frames(self) -> str:
         """The audited frames as text: the split, or the number of folds."""
         return f"{self.folds} folds" if self.folds else self.split
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The names to audit, if they can be."""
+        return self.names or (*POLICIES, "learned", *EVIDENCE)
+
+
+@dataclass(frozen=True)
+class AuditedRound:
+    """The result of an audit.
+
+    Attributes:
+        request: see `AuditRequest`.
+        names: the audited names.
+        context: the audited round; with folds, the round of the first fold.
+        figures: the figures of the audit.
+        reports: the reports of the stages.
+        unmeasured: the names in the request with weights that could not be measured.
+        score_meaning: what a score of the detector estimates; None if unknown.
+        probabilities: a sentence on where probabilities are from; "" without any.
+        missing: why names in `CALIBRATED` were not measured.
+        fusion: the effect of fused boxes by both overlaps; empty without `repredict.fuse`.
+    """
+
+    request: AuditRequest
+    names: tuple[str, ...]
+    context: RoundContext
+    figures: Audit
+    reports: tuple[Report, ...]
+    unmeasured: tuple[str, ...] = ()
+    score_meaning: str | None = None
+    probabilities: str = ""
+    missing: str = ""
+    fusion: tuple[FusionEffect, ...] = ()
 
     @property
     def policies(self) -> tuple[str, ...]:
@@ -80,29 +122,6 @@ class AuditRequest:
     def evidence(self) -> tuple[str, ...]:
         """The names that are evidence."""
         return tuple(name for name in self.names if name in EVIDENCE)
-
-
-@dataclass(frozen=True)
-class AuditedRound:
-    """The result of an audit.
-
-    Attributes:
-        request: see `AuditRequest`.
-        context: the audited round; with folds, the round of the first fold.
-        figures: the figures of the audit.
-        reports: the reports of the stages.
-        unmeasured: the names in the request with weights that could not be measured.
-        score_meaning: what a score of the detector estimates; None if unknown.
-        fusion: the effect of fused boxes by both overlaps; empty without `repredict.fuse`.
-    """
-
-    request: AuditRequest
-    context: RoundContext
-    figures: Audit
-    reports: tuple[Report, ...]
-    unmeasured: tuple[str, ...] = ()
-    score_meaning: str | None = None
-    fusion: tuple[FusionEffect, ...] = ()
 
 
 def run_audit(
@@ -128,36 +147,55 @@ def run_audit(
         reports.append(report)
         on_report(report)
 
-    parts, contexts, fused = [], [], []
+    parts, fused = [], []
     for plan, split, done in _audited_splits(workspace, request, progress, record):
+        if split == "val" and not request.folds and {*CALIBRATED} & {*request.names}:
+            check_calibration(workspace, plan.context.number)
         failed = _run_stages(plan, split, progress, done)
-        parts.append(_evaluate(plan, split, request, failed))
+        parts.append(read_part(plan, split, request.overlap, failed))
         if workspace.config.repredict.fuse:
-            fused.append(_before_and_after(plan, split, failed))
-        contexts.append(plan.context)
-    labels = EvaluatedLabels.joined([part for part, _ in parts])
+            fused.append(before_and_after(plan, split, failed))
+    parts, origin, missing = _with_probabilities(workspace, request, parts)
     weights = {
-        name: np.concatenate([weights[name] for _, weights in parts]) for name in request.names
+        name: np.concatenate([_weights(part, name) for part in parts])
+        for name in request.candidates
     }
+    unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
+    if not request.names:
+        for name in {*CALIBRATED} & {*unmeasured}:
+            del weights[name]
+    context = parts[0].context
     figures = audit(
-        labels,
+        EvaluatedLabels.joined([part.labels for part in parts]),
         weights,
         workspace.config.dataset.categories,
-        np.random.default_rng([workspace.config.run.seed, contexts[0].number]),
+        np.random.default_rng([workspace.config.run.seed, context.number]),
+        reference=request.reference or workspace.config.run.method,
         replicates=request.replicates,
     )
-    unmeasured = tuple(name for name, v in weights.items() if np.isnan(v).any())
-    meaning = score_meaning(workspace.config)
-    effects = _fusion_effects(workspace, request, contexts[0], fused)
-    return AuditedRound(request, contexts[0], figures, tuple(reports), unmeasured, meaning, effects)
+    return AuditedRound(
+        request,
+        tuple(weights),
+        context,
+        figures,
+        tuple(reports),
+        tuple(name for name in unmeasured if name in weights),
+        score_meaning(workspace.config),
+        origin,
+        missing,
+        _fusion_effects(workspace, request, context, fused),
+    )
 
 
 def describe_audit(found: AuditedRound) -> list[str]:
     """Return a summary of the audit in sentences, with its limitations."""
     request = found.request
-    sentences = summary_sentences(found.figures, request.policies, request.evidence)
+    sentences = summary_sentences(found.figures, found.policies, found.evidence)
     without_priors = [name for name in found.unmeasured if name == "rho_det"]
-    without_copies = [name for name in found.unmeasured if name != "rho_det"]
+    without_fit = [name for name in found.unmeasured if name in CALIBRATED]
+    without_copies = [
+        name for name in found.unmeasured if name not in (*without_priors, *without_fit)
+    ]
     if without_copies:
         sentences.append(
             f"Not measured: {', '.join(without_copies)}, because no augmented copy of these frames "
@@ -165,13 +203,22 @@ def describe_audit(found: AuditedRound) -> list[str]:
         )
     if without_priors:
         sentences.append("Not measured: rho_det, because run.priors is empty.")
+    if without_fit:
+        sentences.append(f"Not measured: {', '.join(without_fit)}: {found.missing}.")
+    if {*CALIBRATED} & {*found.names} - {*without_fit}:
+        sentences.append(found.probabilities)
     if not found.figures.counts.counted:
         sentences.append(
             "No object counts: the ground truth of these frames has "
             + (", ".join(describe_others(found.figures.counts)) or "no objects")
             + ". Check dataset.categories."
         )
-    if "score" in request.names:
+    if request.reference not in (None, found.figures.reference):
+        sentences.append(
+            f"{request.reference} gives no weight here, so the reference is "
+            f"{found.figures.reference or 'missing'}."
+        )
+    if "score" in found.names:
         sentences.append(f"The score {describe_score(found.score_meaning)}.")
     if request.split == "labeled" and not request.folds:
         sentences.append(
@@ -189,7 +236,7 @@ def picture_path(workspace: Workspace, found: AuditedRound, suffix: str = "png")
         f"audit-round-{found.context.number:02d}",
         frames,
         found.request.overlap,
-        *(() if names == AuditRequest.names else names),
+        *names,
     )
     return workspace.root / "reports" / f"{'-'.join(parts)}.{suffix}"
 
@@ -200,8 +247,13 @@ def _check(workspace: Workspace, request: AuditRequest) -> None:
         raise ConfigError(
             f"--split {request.split}: use val or labeled; other frames have no ground truth"
         )
+    if request.reference not in (None, *request.candidates):
+        raise ConfigError(
+            f"--reference {request.reference}: not audited; use one of "
+            f"{', '.join(request.candidates)}"
+        )
     check_executor(workspace.config)
-    for name in request.policies:
+    for name in {*request.candidates} - {*EVIDENCE}:
         open_policy(workspace.config, name)
     if request.folds:
         if request.round_number not in (None, 1):
@@ -249,52 +301,6 @@ def _run_stages(plan: Plan, split: str, progress: Progress, done: ReportCallback
     return failed
 
 
-def _evaluate(
-    plan: Plan, split: str, request: AuditRequest, failed: set[str]
-) -> tuple[EvaluatedLabels, dict[str, np.ndarray]]:
-    """Return the evaluated labels of a split, and their weights by policy."""
-    workspace, context = plan.workspace, plan.context
-    frames, complete = _evaluated_frames(plan, split, failed)
-    _, evidence = read_evidence(workspace, context.number, complete)
-    repredicted = _is_repredicted(workspace, context.number, complete)
-    labels = evaluate_frames(
-        _frames(workspace, context, split, frames, workspace.labels(context.number, complete)),
-        match_settings(workspace.config, request.overlap),
-    )
-    return labels, {
-        name: _weights(workspace, name, evidence, context, repredicted=repredicted)
-        for name in request.names
-    }
-
-
-def _evaluated_frames(
-    plan: Plan, split: str, failed: set[str]
-) -> tuple[list[tuple[int, str]], list[int]]:
-    """Return key and name of all evaluated frames, and the keys of those with labels."""
-    # Sorted by key, like the evidence.
-    frames = sorted(
-        (key, name) for name, key in plan.workspace.frames(split).items() if name not in failed
-    )
-    return frames, plan.complete_frames(plan.graph.round_stage("solve"), split)
-
-
-def _before_and_after(
-    plan: Plan, split: str, failed: set[str]
-) -> Mapping[Overlap, tuple[EvaluatedLabels, EvaluatedLabels]]:
-    """Return, by overlap, the labels with the boxes of the detector and with the fused boxes."""
-    workspace, context = plan.workspace, plan.context
-    frames, complete = _evaluated_frames(plan, split, failed)
-    before, after = (
-        list(_frames(workspace, context, split, frames, read(context.number, complete)))
-        for read in (workspace.predictions, workspace.labels)
-    )
-    return {
-        overlap: (evaluate_frames(before, settings), evaluate_frames(after, settings))
-        for overlap in get_args(Overlap)
-        for settings in [match_settings(workspace.config, overlap)]
-    }
-
-
 def _fusion_effects(
     workspace: Workspace,
     request: AuditRequest,
@@ -315,61 +321,29 @@ def _fusion_effects(
     )
 
 
-def _weights(
-    workspace: Workspace,
-    name: str,
-    evidence: Evidence,
-    context: RoundContext,
-    *,
-    repredicted: bool,
-) -> np.ndarray:
+def _with_probabilities(
+    workspace: Workspace, request: AuditRequest, parts: list[AuditedPart]
+) -> tuple[list[AuditedPart], str, str]:
+    """Return the labels with probabilities, where those are from, and why some are missing."""
+    policies = {*request.candidates} - {*EVIDENCE}
+    if not {*CALIBRATED} & {*request.candidates}:
+        return parts, "", ""
+    try:
+        if request.folds or request.split == "labeled":
+            generator = np.random.default_rng(workspace.config.run.seed)
+            parts, origin = cross_fitted(workspace, parts, generator)
+            return parts, origin, "solve.learned.max_wrong needs val frames to be audited on"
+        part, origin = by_the_round(parts[0], sorted(policies))
+    except (TooFewLabels, ConfigError, WorkspaceError) as error:
+        return parts, "", str(error)
+    return [part], origin, ""
+
+
+def _weights(part: AuditedPart, name: str) -> np.ndarray:
     """Return the weights of a policy, or evidence; NaN if what it rests on was not measured."""
-    unmeasured = np.full(len(evidence), np.nan)
-    if name == "rho_det" and not workspace.config.run.priors:
+    unmeasured = np.full(len(part.evidence), np.nan)
+    if name == "rho_det" and not part.workspace.config.run.priors:
         return unmeasured
-    if name in EVIDENCE:
-        return unmeasured if name == "consistency" and not repredicted else EVIDENCE[name](evidence)
-    policy = open_policy(workspace.config, name)
-    v: np.ndarray = policy.weigh(evidence, context.age).v
-    if repredicted or v.any():
-        return v
-    # Without repredictions, weights of 0 say something only if perfect ones would not change them.
-    consistent = replace(evidence, loss=np.zeros(len(evidence)))
-    return unmeasured if policy.weigh(consistent, context.age).v.any() else v
-
-
-def _is_repredicted(workspace: Workspace, round_number: int, frames: Sequence[int]) -> bool:
-    """Return whether an augmented copy of one of the frames has been predicted."""
-    table = bulk.table("consistency")
-    query = select(table.c.frame_id).where(
-        table.c.round == round_number, table.c.views > 0, table.c.frame_id.in_(frames)
-    )
-    return bool(workspace.database.rows(query.limit(1)))
-
-
-def _frames(
-    workspace: Workspace,
-    context: RoundContext,
-    split: str,
-    frames: Sequence[tuple[int, str]],
-    labels: Mapping[int, Detections],
-) -> Iterator[AuditedFrame]:
-    """Yield the frames with their labels; a frame that is not complete has no labels."""
-    points = _points(workspace, context.number)
-    truth = workspace.ground_truth(split)
-    for key, name in frames:
-        found = labels.get(key, Detections.empty())
-        frame = workspace.dataset.read(name, points=False)
-        yield AuditedFrame(
-            found,
-            truth[name],
-            rectangles_in_image(found.boxes, frame),
-            np.array([points.get((key, k), np.nan) for k in range(len(found))], dtype=np.float64),
-        )
-
-
-def _points(workspace: Workspace, round_number: int) -> dict[tuple[int, int], int]:
-    """Return the LiDAR points in each label, by frame key and k."""
-    table = bulk.table("point_prior")
-    query = select(table.c.frame_id, table.c.k, table.c.points).where(table.c.round == round_number)
-    return {(frame, k): points for frame, k, points in workspace.database.rows(query)}
+    if name == "consistency" and not part.repredicted:
+        return unmeasured
+    return EVIDENCE[name](part.evidence) if name in EVIDENCE else part.weights(name)

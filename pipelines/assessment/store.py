@@ -8,7 +8,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from curate.detections import Detections
-from curate.evaluation.audit import Estimate, Figures
+from curate.evaluation.audit import Comparison, Estimate, Figures
 from curate.evaluation.evaluated_labels import WHOLE
 from curate.evaluation.kitti_ap import KittiEvaluation
 from curate.evaluation.kitti_outcomes import Outcomes, object_outcomes
@@ -24,8 +24,10 @@ ESTIMATES = (
     "average_precision",
     "weighted_precision",
     "weighted_recall",
+    "equal_recall_precision",
     "calibration_error",
 )
+NUMBERS = ("equal_recall_power", "calibration_error_by_chance", "calibration_error_limit")
 OVERLAP = "3d"
 
 Row = dict[str, Any]
@@ -39,16 +41,20 @@ def store_audit(workspace: Workspace, found: AuditedRound) -> None:
         "frames": request.frames,
         "overlap": request.overlap,
     }
-    rows: dict[str, list[Row]] = {"audit": [], "audit_slice": [], "audit_bin": []}
+    names = ("audit", "audit_slice", "audit_bin", "audit_difference")
+    rows: dict[str, list[Row]] = {name: [] for name in names}
+    reference = {"reference": found.figures.reference}
     for figures in found.figures.figures:
         of = {**key, "policy": figures.policy, "category": figures.category}
         part = figures.slice
         if part == WHOLE:
-            rows["audit"].append(of | _figures(figures))
+            rows["audit"].append(of | reference | _figures(figures))
             rows["audit_bin"] += [of | row for row in _bins(figures)]
         else:
             edges = {"kind": part.by, "low": part.low, "high": _finite(part.high)}
-            rows["audit_slice"].append(of | edges | _figures(figures))
+            rows["audit_slice"].append(of | edges | reference | _figures(figures))
+    for comparison in found.figures.comparisons:
+        rows["audit_difference"] += [key | row for row in _differences(comparison)]
     with workspace.database.writing() as connection:
         for name, new in rows.items():
             _replace(connection, name, key, new)
@@ -120,12 +126,29 @@ def _figures(figures: Figures) -> Row:
         "right_labels": figures.right,
         "objects": figures.objects,
     }
+    row |= {name: _finite(getattr(figures, name)) for name in NUMBERS}
     for name in ESTIMATES:
         estimate: Estimate = getattr(figures, name)
         row[name] = _finite(estimate.value)
         row[f"{name}_low"] = _finite(estimate.low)
         row[f"{name}_high"] = _finite(estimate.high)
     return row
+
+
+def _differences(comparison: Comparison) -> Iterator[Row]:
+    """Yield a row for every figure in which two policies can be compared."""
+    for figure, difference in comparison.differences.items():
+        if math.isfinite(difference.value):
+            yield {
+                "policy": comparison.policy,
+                "category": comparison.category,
+                "other": comparison.other,
+                "figure": figure,
+                "difference": float(difference.value),
+                "low": _finite(difference.low),
+                "high": _finite(difference.high),
+                "real": int(comparison.is_real(figure)),
+            }
 
 
 def _bins(figures: Figures) -> Iterator[Row]:

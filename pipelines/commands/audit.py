@@ -1,7 +1,7 @@
 """curate audit: compare pseudo-labels and their weights with ground truth."""
 
 import math
-from collections.abc import Iterator
+import operator
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
@@ -27,6 +27,17 @@ if TYPE_CHECKING:
     from pipelines.assessment.audit import AuditedRound
 
 
+FIGURES = {
+    "auroc": "AUROC",
+    "average_precision": "AP",
+    "equal_recall_precision": "precision at equal recall",
+    "calibration_error": "calibration error",
+}
+"""The figures by which policies are compared, with their names in tables."""
+
+_WEIGHTS_PER_TABLE = 7  # as many fit into 80 columns
+
+
 def audit(
     split: Annotated[
         str,
@@ -43,8 +54,9 @@ def audit(
     policy: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option(
-            help="Policy, or a single piece of evidence: score, rho_det or consistency; "
-            "repeatable. Default: pspsl, spsl, threshold, uniform, and all three."
+            help="Policy, or a single piece of evidence: score, rho_det, consistency or "
+            "probability; repeatable. Default: pspsl, spsl, threshold, uniform, all evidence, and "
+            "learned where there are probabilities."
         ),
     ] = None,
     overlap: Annotated[
@@ -53,6 +65,13 @@ def audit(
     replicates: Annotated[
         int, typer.Option(min=10, help="Bootstrap samples for the confidence intervals.")
     ] = 1000,
+    reference: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Audited policy or evidence whose weighted recall the others are brought to. "
+            "Default: run.method.",
+        ),
+    ] = None,
     round_number: RoundOption = None,
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
@@ -67,9 +86,10 @@ def audit(
     Frames with ground truth that the teacher was not trained on are treated as unlabeled, and their
     labels are then compared with the ground truth. A label is correct with an IoU above 0.7 (Car),
     0.5 (others) or evaluation.overlaps. With --folds K, K teachers are each trained without one
-    fold. The chart is reports/audit-*.png. The tables audit, audit_slice (by distance and points)
-    and audit_bin (by weight) contain the numbers: curate query "SELECT policy, category, auroc,
-    auroc_low, auroc_high FROM audit"
+    fold. Policies are compared at equal weighted recall, each weight v as v^power. A difference
+    "may be chance" if its interval over frames (or sequences, if there are any) contains 0. The
+    chart is reports/audit-*.png. The tables audit, audit_slice (by distance and points), audit_bin
+    (by weight) and audit_difference contain the numbers: curate query --named reliability
 
     Example: curate audit --policy pspsl --policy threshold --policy score
     """
@@ -97,6 +117,7 @@ def audit(
         round_number,
         overlap=cast("Overlap", overlap),
         replicates=replicates,
+        reference=reference,
         **options,
     )
     opened = open_workspace(workspace, executor, workers, threads, processes)
@@ -145,27 +166,48 @@ def _print(figures: "Audit", title: str, overlaps: "Mapping[str, float]") -> Non
     thresholds = ", ".join(f"{name} {overlap:g}" for name, overlap in overlaps.items())
     print_line(
         f"{title} (IoU above: {thresholds}); {100 * figures.level:.0f} % intervals over "
-        f"{figures.frames} frames\n"
+        f"{figures.resampled}\n"
+    )
+    whole = by_policy.values()
+    print_table(
+        ("weight of", "AUROC", "interval", "AP", "interval"),
+        [
+            (each.policy, *_with_interval(each.auroc), *_with_interval(each.average_precision))
+            for each in whole
+        ],
+        title="ranking of the labels by weight",
     )
     print_table(
-        ("weight of", "AUROC", "interval", "AP", "precision", "interval", "recall", "calib. error"),
+        ("weight of", "recall", "precision", "interval", "at equal recall", "interval"),
         [
             (
                 each.policy,
-                *(_shown(each.auroc.value), _interval(each.auroc)),
-                _shown(each.average_precision.value),
-                *(_shown(each.weighted_precision.value), _interval(each.weighted_precision)),
-                *(_shown(each.weighted_recall.value), _shown(each.calibration_error.value)),
+                _shown(each.weighted_recall.value),
+                *_with_interval(each.weighted_precision),
+                *_with_interval(each.equal_recall_precision),
             )
-            for each in by_policy.values()
+            for each in whole
         ],
-        title="ranking of labels by weight, and share of the weight on correct labels",
+        title="share of the weight on correct labels, also with the weights raised to the power "
+        f"that gives the weighted recall of {figures.reference}",
     )
     print_table(
-        ("part", "correct", "labels", "objects", *by_policy),
-        _parts(figures),
-        title="AUROC by category, distance and points in the label",
+        ("weight of", "error", "interval", "by chance", "limit", ""),
+        [
+            (
+                each.policy,
+                *_with_interval(each.calibration_error),
+                _shown(each.calibration_error_by_chance),
+                _shown(each.calibration_error_limit),
+                _excess(each),
+            )
+            for each in whole
+        ],
+        title="calibration error, beside that of perfectly calibrated weights: mean, and "
+        f"{100 * figures.level:.0f} % limit",
     )
+    _print_differences(figures)
+    _print_parts(figures)
     first = next(iter(by_policy.values()))
     print_counts({"objects": figures.counts, "labels": figures.label_counts})
     print_line("every object of a category counts, whatever its 2D box, occlusion or truncation")
@@ -205,26 +247,76 @@ def print_fusion(found: "AuditedRound") -> None:
     )
 
 
-def _parts(figures: "Audit") -> Iterator[tuple[Any, ...]]:
-    """Yield a row per category, then one per distance and point count over all categories."""
+def _print_differences(figures: "Audit") -> None:
+    """Print the differences of every weight to the reference, and which of them may be chance."""
+    reference = figures.reference
+    others = [name for name in figures.whole() if name != reference]
+    if reference is None or not others:
+        return
+    compared = [figures.compare(name, reference) for name in others]
+    rows = [
+        (found.policy, label, f"{difference.value:+.3f}", _bounds(difference), verdict)
+        for name, label in FIGURES.items()
+        for found in compared
+        if not math.isnan((difference := found.differences[name]).value)
+        for verdict in ["real" if found.is_real(name) else "may be chance"]
+    ]
+    print_table(
+        ("weight of", "figure", "difference", "interval", ""),
+        rows,
+        title=f"differences to {reference}; other pairs are in the table audit_difference",
+    )
+
+
+def _print_parts(figures: "Audit") -> None:
+    """Print the figures by category, then by distance and points over all categories."""
     rows: dict[tuple[str, str], list[Figures]] = {}
     for each in figures.figures:
         if each.slice.by == "all" or each.category == "all":
             rows.setdefault((each.category, f"{each.slice.by} {each.slice}"), []).append(each)
-    for (category, part), policies in sorted(rows.items(), key=lambda row: row[0][1] != "all all"):
-        first = policies[0]
-        name = category if part == "all all" else part
-        yield (
-            name,
-            first.right,
-            first.labels,
-            "-" if first.objects is None else first.objects,
-            *(_shown(each.auroc.value) for each in policies),
-        )
+    ordered = sorted(rows.items(), key=lambda row: row[0][1] != "all all")
+    parts = {(of if part == "all all" else part): found for (of, part), found in ordered}
+    print_table(
+        ("part", "correct", "labels", "objects"),
+        [
+            (part, first.right, first.labels, "-" if first.objects is None else first.objects)
+            for part, (first, *_) in parts.items()
+        ],
+        title="labels and objects by category, distance and points in the label",
+    )
+    columns = {name: operator.attrgetter(f"{name}.value") for name in FIGURES}
+    by_chance = operator.attrgetter("calibration_error_by_chance")
+    names = list(figures.whole())
+    for title, value in (
+        *((f"{FIGURES[name]} by part", value) for name, value in columns.items()),
+        ("calibration error by chance by part", by_chance),
+    ):
+        for start in range(0, len(names), _WEIGHTS_PER_TABLE):
+            shown = slice(start, start + _WEIGHTS_PER_TABLE)
+            print_table(
+                ("part", *names[shown]),
+                [(part, *map(_shown, map(value, found[shown]))) for part, found in parts.items()],
+                title=title,
+            )
+
+
+def _excess(found: "Figures") -> str:
+    """Return whether the calibration error is larger than chance explains."""
+    if math.isnan(found.calibration_error.value):
+        return ""
+    return "may be chance" if found.calibrated else "beyond chance"
+
+
+def _with_interval(estimate: "Estimate") -> tuple[str, str]:
+    return _shown(estimate.value), _interval(estimate)
 
 
 def _interval(estimate: "Estimate") -> str:
     return "-" if math.isnan(estimate.low) else f"{estimate.low:.2f} - {estimate.high:.2f}"
+
+
+def _bounds(difference: "Estimate") -> str:
+    return f"[{difference.low:+.3f}, {difference.high:+.3f}]"
 
 
 def _shown(value: float) -> str:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipelines.queries.schema import Relation
 
 FORMATS = ("table", "csv", "json")
-AUDITED = ("score", "rho_det", "consistency")
+AUDITED = ("score", "rho_det", "consistency", "probability")
 """Evidence that `curate audit` stores in the column policy, besides the policies."""
 _SCHEMA = ("table", "kind", "column", "type", "unit", "key", "null", "meaning")
 

@@ -1,10 +1,13 @@
 """The numbers of an audit, against values by hand and the functions that compute them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.audited import WEIGHTS, many_labels, six_labels, small_audit
 
-from curate.evaluation.audit import audit
+from curate.detections import as_categories
+from curate.evaluation.audit import COMPARED, audit
 from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
@@ -156,6 +159,124 @@ def test_no_labels_and_no_objects_do_not_fail():
     assert (found.labels, found.right, found.objects) == (0, 0, 0)
     for name in ("share_right", "auroc", "weighted_precision", "weighted_recall"):
         assert np.isnan(getattr(found, name).value)
+
+
+def test_precision_at_equal_recall_by_hand():
+    """The reference has 1.7 on correct labels. All weights are 1 for "all": 2 of 5 are correct."""
+    found = small_audit()
+    assert found.reference == "good"
+    whole = found.whole()
+    assert whole["good"].equal_recall_power == pytest.approx(1)
+    assert whole["good"].equal_recall_precision.value == pytest.approx(1.7 / 1.9)
+    assert whole["all"].equal_recall_power == np.inf
+    assert whole["all"].equal_recall_precision.value == pytest.approx(2 / 5)
+    # 0.05^g + 0.25^g = 1.7 at a small g, where the wrong labels have almost weight 1.
+    power = whole["bad"].equal_recall_power
+    assert 0.05**power + 0.25**power == pytest.approx(1.7)
+    rest = 0.85**power + 0.95**power + 1
+    assert whole["bad"].equal_recall_precision.value == pytest.approx(1.7 / (1.7 + rest))
+    near = part(found, "all", "all", "0-20 m")
+    assert near.equal_recall_precision.value == pytest.approx(1 / 2)
+
+
+def test_the_reference_can_be_chosen_and_has_to_give_weight():
+    """Weights of 0 and weights that were not measured cannot be the reference."""
+    assert small_audit(reference="bad").reference == "bad"
+    no_weight = {"none": np.zeros(6), "lost": np.full(6, np.nan)}
+    found = small_audit({**no_weight, "all": np.ones(6)}, reference="lost")
+    assert found.reference == "all"
+    assert np.isnan(found.whole()["none"].equal_recall_precision.value)
+    assert small_audit(no_weight).reference is None
+
+
+def test_calibrated_weights_are_within_chance_and_others_beyond():
+    """Correct with a probability of v, of v^3, and with all weights 1."""
+    labels, _ = many_labels()
+    generator = np.random.default_rng(2)
+    v = generator.random(len(labels))
+    labels.correct[:] = generator.random(len(labels)) < v
+    whole = audit_of(labels, {"p": v, "bold": np.cbrt(v), "one": np.ones(len(v))}).whole()
+    assert whole["p"].calibrated
+    assert whole["p"].calibration_error_by_chance < whole["p"].calibration_error_limit
+    assert not whole["bold"].calibrated
+    assert not whole["one"].calibrated
+    assert whole["one"].calibration_error_limit == 0
+
+
+def test_every_figure_of_two_policies_is_compared():
+    """The better policy is better in each; a copy of it has no difference at all."""
+    labels, weights = many_labels()
+    found = audit_of(labels, {**weights, "copy": weights["fair"].copy()})
+    better, same = found.compare("fair", "blind"), found.compare("fair", "copy")
+    for name in COMPARED:
+        one, other = (getattr(found.whole()[policy], name).value for policy in ("fair", "blind"))
+        assert better.differences[name].value == pytest.approx(one - other)
+        assert (same.differences[name].low, same.differences[name].high) == (0, 0)
+        assert not same.is_real(name)
+    for name in ("auroc", "average_precision", "equal_recall_precision"):
+        assert better.is_real(name)
+        assert better.negated().differences[name].high == -better.differences[name].low
+
+
+def test_chance_is_called_real_about_as_often_as_the_level_says():
+    """Two policies that differ by noise only, 95 % intervals of 60 data sets: at most 8 real."""
+    real = dict.fromkeys(COMPARED, 0)
+    for seed in range(60):
+        labels, _ = many_labels(frames=40, seed=seed)
+        noise = np.random.default_rng(500 + seed).random((2, len(labels)))
+        weights = {str(i): np.clip(0.3 * labels.correct + 0.7 * noise[i], 0, 1) for i in (0, 1)}
+        found = audit(labels, weights, (), np.random.default_rng(seed), replicates=200)
+        compared = found.compare("0", "1")
+        for name in COMPARED:
+            real[name] += compared.is_real(name)
+    assert max(real.values()) <= 8
+    assert sum(real.values()) > 0
+
+
+def in_sequences(labels, count):
+    """Return the labels with each run of frames in a sequence."""
+    names = [f"drive {frame * count // labels.frames}" for frame in range(labels.frames)]
+    return replace(labels, sequence=as_categories(names))
+
+
+def test_frames_of_a_sequence_are_resampled_together():
+    """Sequences of copies of one frame have the wider interval of the frames that were copied."""
+    labels, weights = many_labels(frames=12)
+    copies = np.tile(np.arange(len(labels)), 5)
+    copied = replace(
+        labels,
+        frames=60,
+        **{
+            name: getattr(labels, name)[copies]
+            for name in ("category", "distance", "points", "correct", "counted", "neutral")
+        },
+        **{name: getattr(labels, name)[copies] for name in ("object_category", "object_distance")},
+        frame_index=labels.frame_index[copies] + 12 * np.repeat(np.arange(5), len(labels)),
+        object_frame=labels.object_frame[copies] + 12 * np.repeat(np.arange(5), len(labels)),
+        sequence=as_categories([f"drive {frame % 12:02d}" for frame in range(60)]),
+    )
+    many = {name: v[copies] for name, v in weights.items()}
+    once, together = audit_of(labels, weights), audit_of(copied, many)
+    alone = audit_of(replace(copied, sequence=as_categories([""] * 60)), many)
+    assert (once.sequences, together.sequences, alone.sequences) == (None, 12, None)
+    assert (together.resampled, alone.resampled) == ("12 sequences", "60 frames")
+    for name in ("auroc", "weighted_precision", "equal_recall_precision", "calibration_error"):
+        one, same, narrow = (getattr(found.whole()["fair"], name) for found in
+                             (once, together, alone))  # fmt: skip
+        assert (same.low, same.high) == pytest.approx((one.low, one.high))
+        assert narrow.high - narrow.low < 0.7 * (same.high - same.low)
+
+
+def test_few_sequences_cannot_show_that_a_difference_is_real():
+    """Five sequences that all favour one policy are chance in 6 % of cases."""
+    labels, weights = many_labels()
+    for count, real in ((5, False), (6, True)):
+        found = audit_of(in_sequences(labels, count), weights)
+        assert found.sequences == count
+        assert found.compare("good", "blind").beyond_chance is real
+    single = audit_of(in_sequences(labels, 1), weights)
+    assert (single.sequences, single.resampled) == (1, "60 frames")
+    assert not single.compare("good", "blind").beyond_chance
 
 
 def audit_of(labels, weights):

@@ -1,6 +1,7 @@
 """An audit in sentences and as plain numbers."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 from support.audited import many_labels, six_labels, small_audit
@@ -43,6 +44,45 @@ def test_it_describes_where_the_weight_is():
     assert text.endswith("is on correct labels; all 40.0 %.")
 
 
+def test_it_describes_the_best_at_equal_recall():
+    """Against the reference, whose recall is named; against the next if it is the best itself."""
+    text = " ".join(summary_sentences(small_audit(reference="all"), ("all", "good"), ()))
+    assert "At the weighted recall of all (0.400), good has the greatest share" in text
+    assert "all has 40.0 %; the difference of" in text
+    text = " ".join(summary_sentences(small_audit(), ("all", "good"), ()))
+    assert "At the weighted recall of good (0.340), good has the greatest share" in text
+    assert "all has 40.0 %" in text
+
+
+def test_a_difference_that_may_be_chance_is_called_so():
+    """Two random weights."""
+    labels, weights = many_labels()
+    weights["as blind"] = np.random.default_rng(4).random(len(labels))
+    assert "may be chance" in words(labels, weights, ("blind", "as blind"))
+
+
+def test_it_describes_which_weights_are_calibrated():
+    """With the error that chance explains; the others are named."""
+    labels, _ = many_labels()
+    generator = np.random.default_rng(2)
+    p = generator.random(len(labels))
+    labels.correct[:] = generator.random(len(labels)) < p
+    text = words(labels, {"p": p, "all": np.ones(len(p))}, ("p", "all"))
+    assert "The calibration error of p, 0.0" in text
+    assert "may be chance: that of perfectly calibrated weights would be 0.0" in text
+    assert "larger than chance explains for all." in text
+
+
+def test_few_sequences_are_described():
+    """Every difference may be chance; the other caveat counts sequences too."""
+    labels, weights = many_labels()
+    sequence = np.array([f"drive {frame % 4}" for frame in range(labels.frames)])
+    text = words(replace(labels, sequence=sequence), weights, ("good", "blind"))
+    assert "With 4 sequences the intervals are only approximate" in text
+    assert "there are fewer than 6 sequences (4): every difference may be chance" in text
+    assert "is significant" not in text
+
+
 def test_evidence_better_than_every_policy_is_described():
     """With its difference; worse evidence is not mentioned."""
     labels, weights = many_labels()
@@ -80,3 +120,8 @@ def test_the_numbers_are_strict_json():
     assert [each["labels"] for each in first["bins"]] == [2, 1, 0, 0, 0, 0, 0, 0, 1, 1]
     assert first["bins"][5]["precision"] is None
     assert numbers["comparisons"][0]["beyond_chance"] is True
+    found = numbers["comparisons"][0]["differences"]["equal_recall_precision"]
+    assert found["low"] <= 0 < found["value"]  # both are 1 if only frame 0 is drawn
+    assert found["beyond_chance"] is False
+    assert (numbers["reference"], numbers["sequences"]) == ("good", None)
+    assert first["calibrated"] in (True, False)

@@ -12,6 +12,7 @@ from curate.evaluation.reliability import (
     MatchSettings,
     auroc,
     average_precision,
+    chance_calibration_errors,
     expected_calibration_error,
     match_to_ground_truth,
     reliability_bins,
@@ -264,3 +265,46 @@ def test_calibrated_weights_have_a_small_error_and_overconfident_ones_a_large_on
     right = generator.random(20_000) < weights
     assert expected_calibration_error(weights, right) < 0.02
     assert expected_calibration_error(weights**0.25, right) > 0.2
+
+
+def simulated_errors(weights, simulations, seed):
+    """Return the calibration errors of labels that are each drawn by themselves."""
+    generator = np.random.default_rng(seed)
+    return np.array(
+        [
+            expected_calibration_error(weights, generator.random(len(weights)) < weights)
+            for _ in range(simulations)
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [
+        np.array([0.3, 0.72, 0.78, 0.95]),
+        np.linspace(0, 1, 60) ** 2,
+        np.random.default_rng(5).random(300),
+        np.concatenate([np.full(400, 0.001), [0.05, 0.09, 0.5], np.ones(50)]),
+    ],
+)
+def test_the_error_by_chance_is_that_of_labels_drawn_one_by_one(weights):
+    """Mean and 95 % quantile, within the error of 2,000 simulations."""
+    slow = simulated_errors(weights, 2000, 0)
+    fast = chance_calibration_errors(weights, np.random.default_rng(1), 20_000)
+    assert fast.mean() == pytest.approx(slow.mean(), rel=0.04)
+    assert np.quantile(fast, 0.95) == pytest.approx(np.quantile(slow, 0.95), rel=0.06)
+
+
+def test_the_error_by_chance_of_one_label_by_hand():
+    """A label of 0.2 is wrong in 80 % of cases, with an error of 0.2; else the error is 0.8."""
+    found = chance_calibration_errors(np.array([0.2]), np.random.default_rng(0), 10_000)
+    assert set(np.round(found, 9)) == {0.2, 0.8}
+    assert found.mean() == pytest.approx(0.8 * 0.2 + 0.2 * 0.8, rel=0.03)
+
+
+def test_certain_weights_have_no_error_by_chance():
+    """0 and 1 leave nothing to chance; without labels or measurement it is undefined."""
+    generator = np.random.default_rng(0)
+    assert not chance_calibration_errors(np.array([0.0, 1.0, 1.0]), generator).any()
+    assert np.isnan(chance_calibration_errors(np.zeros(0), generator)).all()
+    assert np.isnan(chance_calibration_errors(np.full(3, np.nan), generator)).all()

@@ -111,6 +111,9 @@ def test_every_policy_has_its_panel_and_its_auroc(policies):
     assert places(last)[0, 0] == pytest.approx(whole.value)
     assert sorted(drawn(last, "interval")[0].get_xdata()) == [whole.low, whole.high]
     assert set(some) <= set(texts(figure))
+    lines = [text for text in texts(figure) if "at equal recall" in text]
+    assert len(lines) == policies
+    assert all("by chance up to 0." in text for text in lines)
 
 
 def test_undefined_values_are_not_drawn():

@@ -1,16 +1,22 @@
 """`curate audit`: the same stages and weights as for unlabeled frames, then the ground truth."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.pipelines_cli import Curate
 from support.silent import Silent
-from support.toys import write_toy_kitti
+from support.toys import toy_document, write_toy_kitti
 
+from curate.calibration.features import feature_names
+from curate.calibration.model import Calibration, fit_calibration
 from curate.errors import ConfigError, FramesFailed, LeakageError, WorkspaceError
+from curate.evaluation.audit import COMPARED
 from curate.geometry.overlap import bev_iou
+from db import bulk
+from pipelines.assessment import audited_labels, audited_probabilities
 from pipelines.assessment.audit import (
     EVIDENCE,
     POLICIES,
@@ -20,10 +26,17 @@ from pipelines.assessment.audit import (
 )
 from pipelines.engine.rounds import open_round
 from pipelines.labels.evidence import read_evidence
+from pipelines.workspace.config import make_config
 from pipelines.workspace.folds import open_folds
+from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
 
 BIN = "SELECT low, labels, precision FROM audit_bin WHERE category = 'all' AND policy = 'uniform'"
+REFERENCE = (
+    "SELECT reference, equal_recall_power AS power, "
+    "equal_recall_precision = weighted_precision AS same FROM audit "
+    "WHERE category = 'all' AND policy = 'spsl'"
+)
 
 
 def audit(workspace: Workspace, **request: object):
@@ -50,7 +63,7 @@ def test_val_frames_are_processed_like_unlabeled_frames(workspace: Workspace) ->
     assert done == ["predict", "repredict", "points", "semantic"]
     some = found.figures.whole()["pspsl"]
     assert (found.figures.frames, some.labels, some.objects) == (4, 12, 12)
-    assert set(found.figures.whole()) == {*POLICIES, *EVIDENCE}
+    assert set(found.figures.whole()) == {*POLICIES, *EVIDENCE} - {"probability"}
     assert any(each.startswith("The score has no known meaning") for each in describe_audit(found))
     again, done = audit(workspace)
     assert done == []
@@ -263,3 +276,116 @@ def test_iou_thresholds_of_the_settings_hold_for_folds_and_rerun_nothing(
         counts.append(found.figures.whole()["uniform"].right)
     assert counts[0] < counts[1]
     assert done == []
+
+
+def test_the_reference_is_the_method_of_the_run_or_the_requested_one(workspace: Workspace) -> None:
+    """A reference that is not audited is rejected."""
+    assert audit(workspace)[0].figures.reference == "pspsl"
+    spsl = workspace.with_settings("run", method="spsl")
+    assert audit(spsl)[0].figures.reference == "spsl"
+    assert audit(workspace, reference="score")[0].figures.reference == "score"
+    with pytest.raises(ConfigError, match="--reference score: not audited; use one of pspsl, spsl"):
+        audit(workspace, reference="score", names=("pspsl", "spsl"))
+
+
+def test_the_command_stores_and_names_differences(curate: Curate, workspace: Workspace) -> None:
+    """Every two policies in every figure; those that may be chance are called so."""
+    policies = ("--policy", "spsl", "--policy", "uniform", "--policy", "score")
+    code, out, _ = curate("audit", "-w", workspace.root, "--replicates", "50", *policies)
+    assert code == 0
+    assert "differences to spsl" in out
+    query = ("query", "--named", "differences", "--json", "-w", workspace.root)
+    rows = [row for row in json.loads(curate(*query)[1]) if row["category"] == "all"]
+    pairs = {(row["policy"], row["other"]) for row in rows}
+    assert pairs == {("spsl", "uniform"), ("spsl", "score"), ("uniform", "score")}
+    assert {row["figure"] for row in rows} == set(COMPARED)
+    for row in rows:
+        real = row["low"] > 0 or row["high"] < 0
+        assert row["verdict"] == ("real" if real else "may be chance")
+    reference = json.loads(curate("query", REFERENCE, "--json", "-w", workspace.root)[1])
+    assert reference == [{"reference": "spsl", "power": 1.0, "same": 1}]
+
+
+def test_frames_of_a_sequence_are_drawn_together(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four val frames of two drives: too few to distinguish a difference from chance."""
+
+    def drives(_dataset, frames):
+        return {name: f"drive {i // 2}" for i, name in enumerate(sorted(frames))}
+
+    monkeypatch.setattr(audited_labels, "sequences_of", drives)
+    found, _ = audit(workspace)
+    assert (found.figures.sequences, found.figures.resampled) == (2, "2 sequences")
+    assert not any(each.beyond_chance for each in found.figures.comparisons)
+    assert "every difference may be chance" in " ".join(describe_audit(found))
+
+
+@pytest.fixture
+def labeled_only(tmp_path: Path, weights_file: Path) -> Workspace:
+    """Return a workspace of 24 labeled frames, with correct and wrong labels."""
+    write_toy_kitti(tmp_path / "many", frames=24)
+    config = make_config(toy_document(tmp_path / "many", weights_file), "test")
+    return initialise(tmp_path / "many-work", config, "1.0", "")
+
+
+def test_no_fit_sees_the_labels_that_it_is_judged_by(
+    labeled_only: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten fits; each leaves out other frames, and together they leave out every frame once."""
+    left_out: list[int] = []
+
+    def fit(evidence, correct, frame_index, **options):
+        left_out.extend(set(range(24)) - set(frame_index.tolist()))
+        return fit_calibration(evidence, correct, frame_index, **options)
+
+    monkeypatch.setattr(audited_probabilities, "fit_calibration", fit)
+    found, _ = audit(labeled_only, split="labeled")
+    assert sorted(left_out) == list(range(24))
+    assert {*found.names} == {*POLICIES, *EVIDENCE, "learned"}
+    assert found.figures.whole()["probability"].auroc.value > 0.5
+    text = " ".join(describe_audit(found))
+    assert "probabilities of each label are from a fit to the labels of other frames" in text
+
+
+def test_folds_are_fitted_to_the_other_folds(labeled_only: Workspace) -> None:
+    """Every label has a probability; the summary names the other folds."""
+    found, _ = audit(labeled_only, folds=3, names=("probability", "learned"))
+    assert found.unmeasured == ()
+    assert "fit to the labels of the other folds" in " ".join(describe_audit(found))
+
+
+def test_too_few_labels_for_a_fit_are_described(workspace: Workspace) -> None:
+    """Probabilities are then not measured, and not among the default names."""
+    found, _ = audit(workspace, split="labeled", names=("probability", "score"))
+    assert found.unmeasured == ("probability",)
+    text = " ".join(describe_audit(found))
+    assert re.search(r"Not measured: probability: \d correct and \d wrong labels of 1 frames", text)
+    assert "probability" not in audit(workspace, split="labeled")[0].names
+
+
+def test_val_frames_need_the_calibration_of_the_round(workspace: Workspace) -> None:
+    """Without one, an explicit request fails before any work; with one, it is audited."""
+    with pytest.raises(WorkspaceError, match="round 1 has no calibration"):
+        audit(workspace, names=("learned",))
+    assert count(workspace, "SELECT count(*) FROM task") == 0
+    categories = workspace.config.dataset.categories
+    features = len(feature_names(categories))
+    ones = (1.0,) * features
+    stored = Calibration(
+        *(categories, (), {}, (0.0,) * features, ones, (1.0,) + (0.0,) * (features - 1), 0.0),
+        *(0.3, 60, 40, 20),
+    )
+    row = {"round": 1, "source": "calibration", "folds": 0, "overlap": "bev"}
+    row |= {"thresholds": "kitti", "teacher": "", "frames": 20, "labels": 60, "neutral": 0}
+    row |= {"right_labels": 40, "unit": "frame", "held_out_frames": 0, "fit": stored.as_json()}
+    with workspace.database.writing() as connection:
+        bulk.insert_rows(connection, "calibration", [row])
+    found, _ = audit(workspace)
+    assert {"learned", "probability"} < {*found.names}
+    # The only coefficient is that of logit(score), so the probability is the score.
+    one, other = (found.figures.whole()[name] for name in ("probability", "score"))
+    assert one.weighted_recall.value == pytest.approx(other.weighted_recall.value, rel=1e-3)
+    assert "calibration of round 1, which was not fitted to these frames" in " ".join(
+        describe_audit(found)
+    )

@@ -4,8 +4,8 @@ from alembic import op
 
 from db.ddl import box, integer, key, table, text
 
-revision = "0016"
-down_revision = "0011"
+revision = "0015"
+down_revision = "0014"
 branch_labels = None
 depends_on = None
 
