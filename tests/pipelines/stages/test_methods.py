@@ -24,7 +24,7 @@ from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace, sha256
 
 NAMES = [
-    "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "threshold", "st3d",
+    "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "learned", "threshold", "st3d",
     "hssda",
 ]  # fmt: skip
 
