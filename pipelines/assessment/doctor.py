@@ -84,7 +84,7 @@ def examine(workspace: Workspace, frame_id: str | None) -> tuple[str, list[Findi
     findings += examine_camera(frame)
     findings += _guarded("labels", lambda: _labels(workspace, frame))
     findings += _guarded("detector", lambda: _detector(workspace, frame))
-    findings += _guarded("calibration", lambda: _calibration(workspace))
+    findings += _guarded("probabilities", lambda: _probabilities(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     return name, findings
@@ -104,7 +104,7 @@ def report_wrong_inputs(workspace: Workspace) -> None:
     except CurateError:
         return  # the frames that cannot be read are reported by their own check
     findings = [*_guarded("labels", lambda: _labels(workspace, frame))]
-    findings += _guarded("calibration", lambda: _calibration(workspace))
+    findings += _guarded("probabilities", lambda: _probabilities(workspace))
     if semantic:
         findings += _guarded("segmenter", lambda: _segmenter(workspace, frame))
     for finding in findings:
@@ -133,7 +133,7 @@ def _training(config: Config) -> Sequence[Finding]:
     return []
 
 
-def _calibration(workspace: Workspace) -> Sequence[Finding]:
+def _probabilities(workspace: Workspace) -> Sequence[Finding]:
     """Check that the method has frames to learn probabilities from, if it reads any."""
     method = workspace.config.run.method
     if not calibrate.applies(workspace, method):
@@ -142,11 +142,10 @@ def _calibration(workspace: Workspace) -> Sequence[Finding]:
     last = rounds if is_student_trained(workspace) else number
     check_truth(workspace, method, range(number, last + 1))
     source = choose_source(workspace, number)
-    frames = len(workspace.frames("labeled" if source == "folds" else source))
-    of = (
-        f"{source} of {frames} labeled frames" if source == "folds" else f"{frames} {source} frames"
-    )
-    return [Finding("calibration", "ok", f"probabilities are learned from {of}")]
+    split = "labeled" if source == "folds" else source
+    frames = f"{len(workspace.frames(split))} {split} frames"
+    message = f"learned from {'folds of ' if source == 'folds' else ''}{frames}"
+    return [Finding("probabilities", "ok", message)]
 
 
 def _guarded(name: str, check: Callable[[], Sequence[Finding]]) -> Sequence[Finding]:

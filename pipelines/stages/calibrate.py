@@ -34,7 +34,7 @@ from pipelines.stages.calibration_frames import (
 from pipelines.workspace.config import Config
 from pipelines.workspace.workspace import Workspace
 
-_PARTS = 5  # of the frames, each left out once for the figures
+_PARTS = (5, 20)  # of the frames, each left out once for the figures; more if labels are few
 
 Row = dict[str, Any]
 
@@ -159,23 +159,36 @@ def _fit(workspace: Workspace, labels: ComparedLabels) -> Calibration:
 def _out_of_sample(workspace: Workspace, labels: ComparedLabels) -> Row:
     """Return the figures of probabilities in frames that the fit has not used.
 
-    Each part of the frames is left out once. There are no figures if a fit has too few labels then.
+    There are no figures if too few labels are left then.
+    """
+    for parts in _PARTS:
+        try:
+            p = _left_out(workspace, labels, parts)[labels.counted]
+        except TooFewLabels:
+            continue
+        correct = labels.correct[labels.counted]
+        error = expected_calibration_error(p, correct)
+        return {"auroc": auroc(p, correct), "calibration_error": error}
+    return {}
+
+
+def _left_out(workspace: Workspace, labels: ComparedLabels, parts: int) -> np.ndarray:
+    """Return (n,) the probabilities of labels by the fit to the other parts of the frames.
+
+    Raises:
+        TooFewLabels: if a fit has too few labels.
     """
     units = units_of(workspace, labels.frames)[1]
-    part_of = {unit: i % _PARTS for i, unit in enumerate(sorted(set(units)))}
+    part_of = {unit: i % parts for i, unit in enumerate(sorted(set(units)))}
     part = np.array([part_of[unit] for unit in units])
     probability = np.full(len(labels.frame), np.nan)
-    for each in range(min(_PARTS, len(part_of))):
+    for each in sorted(set(part_of.values())):
         others = [name for name, i in zip(labels.frames, part, strict=True) if i != each]
-        try:
-            fit = _fit(workspace, labels.of_frames(others))
-        except TooFewLabels:
-            return {}
         inside = part[labels.frame] == each
-        probability[inside] = fit.probability(labels.evidence.select(inside))
-    p, correct = probability[labels.counted], labels.correct[labels.counted]
-    error = expected_calibration_error(p, correct)
-    return {"auroc": auroc(p, correct), "calibration_error": error}
+        if inside.any():
+            fit = _fit(workspace, labels.of_frames(others))
+            probability[inside] = fit.probability(labels.evidence.select(inside))
+    return probability
 
 
 def _held_out_rows(
