@@ -1,6 +1,7 @@
 """What an evaluation leaves out is said: counts, reasons, nulls, and levels without images."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -164,10 +165,18 @@ def test_the_audit_counts_and_does_not_invent_figures(curate: Curate, work: Path
     assert rows["spsl"] == {"weighted_recall": None, "calibration_error": None}
     assert rows["uniform"] == {"weighted_recall": 1.0, "calibration_error": 0.0}
     _, out, _ = curate("audit", "-w", work, "--replicates", "20")
-    assert "0.500" not in out
+    ranking, by_part = (
+        out.partition(title)[2].partition("\n\n")[0]
+        for title in ("ranking of the labels by weight", "AUROC by part")
+    )
+    assert {line.split()[1] for line in ranking.splitlines()[3:]} == {"-"}  # the AUROC
+    assert ranking.count("\n") == 9
+    assert "distance 20-40 m" in by_part
+    assert not re.search(r"\d\.\d{3}", by_part)
     assert "Not measured: spsl, consistency, because no augmented copy" in out
     lines = [line.split() for line in out.splitlines()]
-    assert ["spsl", *["-"] * 5, "-", "-"] in lines
+    assert lines.count(["spsl", *["-"] * 4]) == 2  # ranking, calibration
+    assert lines.count(["spsl", *["-"] * 5]) == 1  # weight on correct labels
     assert ["Car", "labels", "4", "4"] in lines
 
 
