@@ -16,9 +16,9 @@ def demo(
     val: Annotated[int, typer.Option(min=4, help="Number of validation frames to simulate.")] = 120,
     labeled: Annotated[
         float, typer.Option(help="Share of the training frames that are labeled.")
-    ] = 0.08,
+    ] = 0.04,
     rounds: Annotated[int, typer.Option(min=1, help="Number of rounds.")] = 1,
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 400,
+    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps of each training.")] = 250,
     seed: Annotated[
         int, typer.Option(min=0, help="Random seed of simulation, split and training.")
     ] = 0,

@@ -463,7 +463,7 @@ class CalibrateSection(Section):
         default="bev", description="Overlap with an object that makes a label correct."
     )
     thresholds: Literal["kitti", "relaxed"] = Field(
-        default="kitti",
+        default="relaxed",
         description="IoU that it must exceed: those of evaluation.overlaps (0.7 for Car, 0.5 for "
         "others), or relaxed ones (0.5 and 0.25).",
     )

@@ -111,7 +111,7 @@ def test_a_changed_threshold_repeats_the_fit_and_what_follows(data: Path, tmp_pa
         ("run", {"priors": ("points", "density")}),
         ("dataset", {"categories": (*OVERLAPS, "Tram")}),
         ("evaluation", {"overlaps": {"Car": 0.1}}),
-        ("calibrate", {"thresholds": "relaxed"}),
+        ("calibrate", {"thresholds": "kitti"}),
     ):
         other = changed.with_settings(section, **values)
         assert state_of(other, "calibrate", "learned") == "stale", section
