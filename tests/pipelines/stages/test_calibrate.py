@@ -41,7 +41,7 @@ def make(data: Path, root: Path, calibration: str = "0.56", **sections: Any) -> 
     detector = shutil.copy(data / "detector.txt", root / "detector.txt")
     document: dict[str, Any] = toy_document(data / "kitti", Path(detector))
     document["run"] = {"method": "learned", "executor": "serial", "priors": ("points",)}
-    document["evaluation"] = {"overlaps": OVERLAPS}
+    document["evaluation"], document["calibrate"] = {"overlaps": OVERLAPS}, {"thresholds": "kitti"}
     for name, values in sections.items():
         document[name] = {**document.get(name, {}), **values}
     return initialise(root / "work", make_config(document, "test"), "0.6", "", calibration)
@@ -111,7 +111,7 @@ def test_a_changed_threshold_repeats_the_fit_and_what_follows(data: Path, tmp_pa
         ("run", {"priors": ("points", "density")}),
         ("dataset", {"categories": (*OVERLAPS, "Tram")}),
         ("evaluation", {"overlaps": {"Car": 0.1}}),
-        ("calibrate", {"thresholds": "kitti"}),
+        ("calibrate", {"thresholds": "relaxed"}),
     ):
         other = changed.with_settings(section, **values)
         assert state_of(other, "calibrate", "learned") == "stale", section
