@@ -48,7 +48,7 @@ class ProposedObjects:
 
     Attributes:
         round: round of the labels; 0 for ground truth.
-        frames: number of frames.
+        frames: number of frames without the failed ones.
         categories: number of proposals by category.
         failed: number of frames that failed.
     """
@@ -141,7 +141,7 @@ def propose(
     _store(workspace, number, rows)
     names = [name for _, columns in rows for name in columns["category"]]
     counts = {name: names.count(name) for name in sizes}
-    return ProposedObjects(number, len(frames), counts, len(failed))
+    return ProposedObjects(number, len(rows), counts, len(failed))
 
 
 def _checked_sizes(workspace: Workspace, split: str) -> dict[str, np.ndarray]:
