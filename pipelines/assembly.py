@@ -302,6 +302,12 @@ def open_segmenter(config: Config, store: MapStore | None = None) -> Segmenter:
     """
     section = config.segmenter
     path = segmenter_path(config)
+    if section.name == "none":
+        raise ConfigError(
+            "segmenter.name is 'none', and the semantic prior needs a segmenter: set "
+            "segmenter.name and segmenter.path in curate.toml, or leave 'semantic' out of "
+            "run.priors"
+        )
     if path is None:
         raise ConfigError(
             f"segmenter '{section.name}' needs a path: set segmenter.path in curate.toml, or leave "

@@ -583,7 +583,7 @@ def _evidence(side: _Side, row: int) -> str:
     points = int(side.points[row])
     text = f"{points} {'point' if points == 1 else 'points'}"
     share = side.share[row]
-    return text if np.isnan(share) else f"{text} and {share:.0%} of its pixels"
+    return text if np.isnan(share) else f"{text} and {share:.0%} of its image area"
 
 
 def _suspect(side: _Side, row: int, findings: Sequence[Finding], prediction: int) -> Suspect:

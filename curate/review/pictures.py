@@ -27,10 +27,15 @@ class NumberedLabels(ShownLabels):
         return np.where(self._is_requested, 1.0, 0.25 + 0.25 * self.weights)
 
     def caption(self, index: int) -> tuple[str, str]:
-        """Return k, with a mark if a decision is requested, and category, s and v."""
+        """Return k, with a mark if a decision is requested, and category, s and v.
+
+        A proposal has no weight, and neither s nor v.
+        """
         score, weight = self.scores[index], self.weights[index]
         mark = " ?" if self._is_requested[index] else ""
         name = f"k{self.number(index)}{mark}"
+        if np.isnan(weight):
+            return name, f"{self.categories[index]}, proposal"
         return name, f"{self.categories[index]} s {score:.2f} v {weight:.2f}"
 
     @property
@@ -44,7 +49,7 @@ def draw_review(frame: Frame, shown: ShownFrame, *, title: str = "") -> np.ndarr
         shown.array,
         as_categories([box.category for box in shown.boxes]),
         np.array([box.score for box in shown.boxes], dtype=np.float64),
-        np.array([box.weight for box in shown.boxes], dtype=np.float64),
+        np.array([np.nan if box.is_proposal else box.weight for box in shown.boxes]),
         numbers=np.array([box.k for box in shown.boxes], dtype=np.int64),
         decisions=np.array(["human" if box.human else "" for box in shown.boxes], dtype="U8"),
         requested=np.array([box.asked for box in shown.boxes], dtype=bool),

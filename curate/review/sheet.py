@@ -19,6 +19,8 @@ from curate.files.json_text import read_json
 
 MANIFEST = "review.json"
 FORMAT = "curate review 1"
+FIRST_PROPOSAL_K = 2_000_000
+"""Proposal n of a frame is shown with the number k = FIRST_PROPOSAL_K + n."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,8 @@ class ShownBox:
         k: number of the prediction in its round, or of the human label in `weighted_labels`.
         category: its category.
         box: x, y, z, length, width, height, yaw in the LiDAR frame.
-        score: of the detector; 1 for a human label.
-        weight: of the policy; 1 for a human label.
+        score: of the detector; 1 for a human label, 0 for a proposal.
+        weight: of the policy; 1 for a human label, 0 for a proposal.
         asked: whether a decision is requested; the other boxes are context.
         human: whether it already is a human label.
     """
@@ -42,6 +44,11 @@ class ShownBox:
     weight: float
     asked: bool
     human: bool = False
+
+    @property
+    def is_proposal(self) -> bool:
+        """Whether it is a missed object of `curate propose`, which has no score and no weight."""
+        return self.k >= FIRST_PROPOSAL_K
 
 
 @dataclass(frozen=True)

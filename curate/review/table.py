@@ -50,6 +50,8 @@ def write_table(folder: Path, sheet: Sheet) -> None:
         for box in frame.boxes:
             asked = "yes" if box.asked else "human" if box.human else ""
             numbers = (f"{box.score:.3f}", f"{box.weight:.3f}")
+            if box.is_proposal:
+                numbers = ("", "")
             writer.writerow((frame.frame, box.k, asked, box.category, *numbers, ""))
     replace_file(folder / TABLE, text.getvalue().encode())
 

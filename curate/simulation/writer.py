@@ -197,7 +197,7 @@ def _settings(
 def _sequence_length(frames: int, sequences: int) -> int:
     """Return the number of frames of each sequence."""
     if not 1 <= sequences <= frames:
-        raise ConfigError(f"sequences must be 1 to the {frames} frames, not {sequences}")
+        raise ConfigError(f"sequences must be 1 to {frames}, the number of frames, not {sequences}")
     if frames % sequences:
         raise ConfigError(
             f"{frames} frames are not divisible into {sequences} sequences of equal length; "

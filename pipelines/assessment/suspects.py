@@ -316,9 +316,13 @@ def _splits_to_check(workspace: Workspace, request: SuspectRequest) -> tuple[str
     if is_trainable(workspace) and "labeled" in found:
         highest = counts["labeled"]
         if not 2 <= request.folds <= highest:
-            advice = "use --split val" if highest < 2 else f"use 2 to {highest}"
-            frames = "1 labeled frame" if highest == 1 else f"{highest} labeled frames"
-            raise ConfigError(f"--folds {request.folds}: there are {frames}; {advice}")
+            if highest >= 2:
+                raise ConfigError(
+                    f"--folds {request.folds}: there are {highest} labeled frames; "
+                    f"use 2 to {highest}"
+                )
+            advice = "use --split val" if counts["val"] else "label further frames"
+            raise ConfigError(f"folds need 2 labeled frames, and there is only one; {advice}")
     return found
 
 

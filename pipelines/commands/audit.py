@@ -238,7 +238,7 @@ def print_fusion(found: "AuditedRound") -> None:
             (
                 *(each.overlap, each.category, each.labels),
                 *(_shown(each.before.value), _shown(each.after.value)),
-                *(_shown(each.difference.value), _interval(each.difference)),
+                *(f"{each.difference.value:+.3f}", _bounds(each.difference)),
                 "" if each.beyond_chance else "may be chance",
             )
             for each in found.fusion

@@ -43,7 +43,9 @@ def propose(
         print_json(found)
     else:
         counts = ", ".join(f"{number} {name}" for name, number in found.categories.items())
-        where = f"labels of round {found.round}" if found.round else "ground truth"
-        print_line(f"proposals without {where} in {found.frames} {split} frames: {counts}")
+        where = f"a label of round {found.round}" if found.round else "ground truth"
+        print_line(
+            f"{counts} proposed in {found.frames} {split} frames, at image masks without {where}"
+        )
     if found.failed:
         raise FramesFailed(f"{found.failed} frames failed; fix the files and rerun")

@@ -123,7 +123,7 @@ def _named(name: str, policy: str | None, round_number: int | None, url: "URL") 
     valid = (*POLICIES.classes, *AUDITED)
     if policy is not None and policy not in valid and ":" not in policy:
         raise ConfigError(
-            f"--policy {policy}: unvalid policy: use one of "
+            f"--policy {policy}: unknown policy: use one of "
             f"{', '.join(valid)}, or module:Class{did_you_mean(policy, valid)}"
         )
     postgresql = url.get_backend_name() == "postgresql"

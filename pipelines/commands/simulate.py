@@ -42,6 +42,7 @@ def simulate(
     kept.
 
     Example: curate simulate data/simulated --frames 400 --seed 0
+
     Example: curate simulate data/drives --frames 400 --sequences 20
     """
     from curate.simulation import simulate as run

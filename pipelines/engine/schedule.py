@@ -1,6 +1,7 @@
 """Running all stages of all rounds."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from pipelines.assembly import check_executor
 from pipelines.engine.graph import Graph
@@ -53,7 +54,8 @@ def run_all(
         for cache in graph.cache_stages if evidence else ():
             outside = Plan(workspace, outside_rounds(workspace), graph)
             for split in cache.ahead(workspace):
-                yield run_frames(outside, cache, executor, progress, split)
+                report = run_frames(outside, cache, executor, progress, split)
+                yield replace(report, stage=f"{report.stage} {split}")
         for number in range(1, total + 1):
             plan = Plan(workspace, open_round(workspace, number, rounds), graph)
             if evidence:

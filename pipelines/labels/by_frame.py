@@ -2,25 +2,43 @@
 
 from sqlalchemy import BindParameter, Connection, bindparam, func, or_, select
 
-from curate.errors import WorkspaceError
+from curate.errors import WorkspaceError, error_prefix
 from curate.exporters.base import bad_weight
 from db import bulk
+from pipelines.registry import POLICIES
 from pipelines.workspace.workspace import Workspace
 
 
 def weighted_round(workspace: Workspace, policy: str, number: int | None = None) -> int | None:
-    """Return the given round, or the last one with weights of a policy; None if it has none."""
+    """Return the given round, or the last one with weights of a policy; None if it has none.
+
+    Raises:
+        ConfigError: if there are none, and no policy has this name.
+    """
     weight = bulk.table("weight")
     query = select(func.max(weight.c.round)).where(weight.c.policy == policy)
     if number is not None:
         query = query.where(weight.c.round == number)
     with workspace.database.reading() as connection:
         found: int | None = connection.execute(query).scalar_one()
+    if found is None:
+        check_policy_name(policy)
     return found
 
 
+def check_policy_name(policy: str) -> None:
+    """Raise ConfigError if no policy has this name, which `curate solve` could not compute."""
+    with error_prefix("--policy"):
+        POLICIES.check_name(policy)
+
+
 def not_weighted_error(round_number: int, policy: str) -> WorkspaceError:
-    """Return the error for a round without weights of a policy."""
+    """Return the error for a round without weights of a policy.
+
+    Raises:
+        ConfigError: if no policy has this name.
+    """
+    check_policy_name(policy)
     return WorkspaceError(
         f"round {round_number} has no labels weighted by {policy}; "
         f"run `curate solve --round {round_number} --policy {policy}`"

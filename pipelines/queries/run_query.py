@@ -187,6 +187,10 @@ def _suggestion(message: str, read_names: Callable[[], Names]) -> str:
         suggestion = did_you_mean(name, _FUNCTION_NAMES)
         return _hint(suggestion, "docs/queries.md lists the functions of curate")
     names = read_names()
+    owners = sorted(table for table, columns in names.items() if name in columns)
+    if kind == "column" and owners:
+        others = " and others" if len(owners) > 3 else ""
+        return f"; it is a column of {', '.join(owners[:3])}{others}"
     known = names if kind in {"table", "relation"} else {c for each in names.values() for c in each}
     return _hint(
         did_you_mean(name, sorted(known)), "`curate query --schema` lists tables and columns"

@@ -20,7 +20,7 @@ _HOW_TO = """Review {id}: round {round}, weights by {policy}, {frames} frames, {
 boxes to review.
 
 pictures/FRAME.png shows a frame; each box has its k, and the boxes to review are marked "?".
-{editor}
+{editor}{proposals}
 review.csv: write accept or reject into the column decision of a label k. accept in the row `all` of
 a frame accepts all its boxes that you leave unchanged.
 
@@ -30,6 +30,10 @@ rename is corrected; one that you draw is added.
 
 Then run: curate review import THIS_FOLDER --dry-run
 """
+_PROPOSALS = (
+    "Boxes with k of 2000000 or more are proposals of `curate propose`: objects that may have been"
+    "\nmissed. They have no score and no weight.\n"
+)
 _EDITORS = {
     "kitti": "label_2/FRAME.txt has the boxes as KITTI label lines, in the order of review.csv.\n",
     "labelcloud": (
@@ -99,6 +103,7 @@ def _fill(
     text = _HOW_TO.format(
         id=sheet.id, round=sheet.round, policy=sheet.policy, frames=len(sheet.frames),
         asked=sheet.asked, boxes=sheet.boxes, editor=_EDITORS.get(editor.name, ""),
+        proposals=_PROPOSALS if any(b.is_proposal for f in sheet.frames for b in f.boxes) else "",
     )  # fmt: skip
     (folder / "README.txt").write_text(text.replace("review.csv", TABLE), encoding="utf-8")
 

@@ -11,7 +11,7 @@ from curate.errors import ConfigError, LeakageError, WorkspaceError
 from curate.evaluation.label_changes import compare_labels
 from curate.geometry.overlap import bev_iou
 from curate.review.human_labels import SAME_OBJECT_IOU
-from curate.review.sheet import Sheet, ShownBox, ShownFrame
+from curate.review.sheet import FIRST_PROPOSAL_K, Sheet, ShownBox, ShownFrame
 from db import bulk
 from db.models import BOX_COLUMNS
 from db.views import WEIGHTED_LABELS
@@ -26,8 +26,6 @@ EVEN_ODDS = 0.5
 CONTEXT_WEIGHT = 0.1
 """Other labels of the same frames are shown as context if their weight is at least this."""
 
-FIRST_PROPOSAL_K = 2_000_000
-"""Proposal n of a frame is shown with k = 2000000 + n."""
 
 LabelKeys = Collection[tuple[str, int]]
 """Labels by frame name and number k."""

@@ -195,6 +195,8 @@ def _held_out_rows(
     workspace: Workspace, calibration: Calibration, labels: ComparedLabels
 ) -> Iterator[Row]:
     """Yield the rows of `calibration_label`, without the round."""
+    if not labels.frames:
+        return
     probability = calibration.probability(labels.evidence)
     units = units_of(workspace, labels.frames)[1]
     for i, frame in enumerate(labels.frame.tolist()):

@@ -64,7 +64,7 @@ def function(workspace: Workspace, context: RoundContext) -> Fuse:
     table = bulk.table("consistency")
     query = select(func.max(table.c.views)).where(table.c.round == context.number)
     if _has_own_views(workspace):
-        _warn_of_few(workspace.database.rows(query)[0][0] or 0, "the results have")
+        _warn_of_few(workspace.database.rows(query)[0][0] or 0, "views of the results:")
     return Fuse()
 
 
@@ -110,6 +110,6 @@ def _has_own_views(workspace: Workspace) -> bool:
 def _warn_of_few(views: int, place: str) -> None:
     if views < ADVISED_VIEWS:
         warn_once(
-            f"repredict.fuse = true: {place} {views}; use {ADVISED_VIEWS} views or more, and "
+            f"repredict.fuse = true: {place} {views}; use {ADVISED_VIEWS} or more, and "
             "compare the share of correct boxes before and after fusion with `curate audit`"
         )

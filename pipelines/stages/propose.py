@@ -48,7 +48,7 @@ class ProposedObjects:
 
     Attributes:
         round: round of the labels; 0 for ground truth.
-        frames: number of frames.
+        frames: number of frames without the failed ones.
         categories: number of proposals by category.
         failed: number of frames that failed.
     """
@@ -138,10 +138,10 @@ def propose(
         _log.warning("%s is left out: %s", title, error)
     if failed and not rows:
         raise FramesFailed(f"all {len(failed)} frames failed; the first: {failed[0][1]}")
-    _store(workspace, number, list(frames.values()), rows)
+    _store(workspace, number, rows)
     names = [name for _, columns in rows for name in columns["category"]]
     counts = {name: names.count(name) for name in sizes}
-    return ProposedObjects(number, len(frames), counts, len(failed))
+    return ProposedObjects(number, len(rows), counts, len(failed))
 
 
 def _checked_sizes(workspace: Workspace, split: str) -> dict[str, np.ndarray]:
@@ -225,12 +225,10 @@ def _weighted_labels(
     return number, {name: np.array(boxes) for name, boxes in of_frame.items()}
 
 
-def _store(
-    workspace: Workspace, number: int, keys: Sequence[int], rows: Sequence[_FrameColumns]
-) -> None:
-    """Replace the proposals of some frames."""
+def _store(workspace: Workspace, number: int, rows: Sequence[_FrameColumns]) -> None:
+    """Replace the proposals of some frames; those of others, such as failed ones, are kept."""
     table = bulk.table("proposal")
-    wanted = set(keys)
+    wanted = {key for key, _ in rows}
     with workspace.database.writing() as connection:
         stored = select(table.c.frame_id).where(table.c.round == number).distinct()
         old = [key for (key,) in bulk.select(connection, stored) if key in wanted]

@@ -229,6 +229,7 @@ def test_a_report_needs_no_network(curate: Curate, workspace: Workspace, tmp_pat
     ("settings", "message"),
     [
         ({"name": "onnx", "path": None}, "segmenter 'onnx' needs a path"),
+        ({"name": "none"}, "segmenter.name is 'none', and the semantic prior needs"),
         (
             {"name": "onnx", "path": "gone.onnx", "classes": "voc"},
             r"^segmenter\.path: .*gone\.onnx",

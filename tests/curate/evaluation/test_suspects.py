@@ -95,7 +95,7 @@ def test_a_confident_prediction_without_a_label_is_suspicious() -> None:
     assert (suspect.frame, suspect.label, suspect.prediction) == (0, -1, 2)
     assert (suspect.kind, suspect.category) == ("missing", "Car")
     assert suspect.suspicion > 0.9
-    assert "score 0.90, 40 points and 80% of its pixels" in suspect.reason
+    assert "score 0.90, 40 points and 80% of its image area" in suspect.reason
 
 
 @pytest.mark.parametrize(

@@ -182,8 +182,8 @@ def test_sequences_resume_and_are_not_mixed_with_single_frames(drives: Path) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"sequences": 0}, "sequences must be 1 to the 8 frames, not 0"),
-        ({"sequences": 9}, "sequences must be 1 to the 8 frames, not 9"),
+        ({"sequences": 0}, "sequences must be 1 to 8, the number of frames, not 0"),
+        ({"sequences": 9}, "sequences must be 1 to 8, the number of frames, not 9"),
         ({"sequences": 3}, "8 frames are not divisible into 3 sequences .* choose 6 frames"),
         ({"sequences": 2, "val_frames": 3}, "a multiple of the 4 frames of a sequence, not 3"),
     ],

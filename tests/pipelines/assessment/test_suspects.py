@@ -150,3 +150,20 @@ def test_frames_without_labels_and_too_many_folds(
     code, _, err = curate("suspects", "-w", workspace.root)
     assert code != 0
     assert err.startswith("error: there are no labeled or val frames")
+
+
+def test_folds_of_a_single_labeled_frame(
+    curate: Curate, workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The advice is one that can be followed."""
+    one = dict(list(workspace.frames("labeled").items())[:1])
+    given = Workspace.frames
+    splits = {"labeled": one}
+    monkeypatch.setattr(Workspace, "frames", lambda self, name: splits.get(name, given(self, name)))
+    monkeypatch.setattr("pipelines.assessment.suspects.is_trainable", lambda _: True)
+    expected = "error: folds need 2 labeled frames, and there is only one; "
+    _, _, err = curate("suspects", "-w", workspace.root)
+    assert err == f"{expected}use --split val\n"
+    splits["val"] = {}
+    _, _, err = curate("suspects", "-w", workspace.root)
+    assert err == f"{expected}label further frames\n"

@@ -162,6 +162,17 @@ def test_an_unknown_name_refers_to_the_schema(curate: Curate, workspace: Workspa
     assert "`curate query --schema` lists tables and columns" in err
 
 
+def test_a_column_of_another_table_is_named_with_its_table(
+    curate: Curate, workspace: Workspace, engine: str
+) -> None:
+    """A suggestion of the very same name would not help."""
+    _, _, err = curate("query", "SELECT rho_diff FROM frame", "-w", workspace.root)
+    assert "; it is a column of point_prior, weighted_labels" in err
+    _, _, err = curate("query", "SELECT frame_id FROM weighted_labels", "-w", workspace.root)
+    assert "; it is a column of " in err
+    assert err.endswith(" and others\n")
+
+
 def test_an_unknown_function_gets_a_suggestion(
     curate: Curate, workspace: Workspace, engine: str
 ) -> None:

@@ -18,6 +18,7 @@ from pipelines.assessment.audit import AuditRequest, run_audit
 from pipelines.engine.executors.serial import SerialExecutor
 from pipelines.engine.runner import run_frames
 from pipelines.labels.calibration import read_calibration
+from pipelines.labels.label_evidence import further_columns
 from pipelines.round import open_plan
 from pipelines.workspace.config import make_config
 from pipelines.workspace.setup import initialise
@@ -94,6 +95,17 @@ def test_it_learns_from_frames_that_are_set_aside(calibrated: Workspace) -> None
     assert len(weights) == 9
     assert all(0 < each["probability"] < 1 for each in weights)
     assert stored(calibrated, "calibration_label") == []
+
+
+def test_further_evidence_is_learned_from_frames_that_are_set_aside(
+    data: Path, tmp_path: Path
+) -> None:
+    """Also if no frames are left for max_wrong, so that none of them has such evidence."""
+    workspace = make(data, tmp_path, run={"priors": ("points", "density")})
+    run_workspace(workspace, train=False)
+    fit = read_calibration(workspace, 1)
+    assert fit.further == further_columns(workspace.config) != ()
+    assert stored(workspace, "calibration_label") == []
 
 
 def test_a_second_run_does_nothing(calibrated: Workspace) -> None:

@@ -150,7 +150,7 @@ def test_few_views_are_reported_before_the_first_frame(
     lines = [each for each in caplog.messages if "repredict.fuse" in each]
     assert len(lines) == (views < 3)
     for line in lines:
-        assert line.startswith("repredict.fuse = true: repredict.views is 1; use 3 views or more")
+        assert line.startswith("repredict.fuse = true: repredict.views is 1; use 3 or more")
         assert "\n" not in line
 
 
@@ -211,7 +211,7 @@ def test_results_with_copies_of_their_own_are_fused(
     for name in ("predict", "repredict", "fuse"):
         assert run_stage(fused, name).done == 2
     [line] = [each for each in caplog.messages if "repredict.fuse" in each]
-    assert "the results have 1; use 3 views or more" in line
+    assert "views of the results: 1; use 3 or more" in line
     boxes = expected(fused)
     for key, found in fused.labels(1, list(boxes)).items():
         np.testing.assert_array_equal(found.boxes, boxes[key])

@@ -10,6 +10,7 @@ from support.car_masks import TRUTH
 from support.pipelines_cli import Curate
 from support.reviewed import advance, decide
 
+from curate.errors import FramesFailed
 from pipelines.workspace.workspace import Workspace
 
 TRUE_CARS = "support.car_masks:TrueCars"
@@ -66,8 +67,10 @@ def test_objects_without_a_label_are_proposed_reviewed_and_in_no_export(
     assert code == 0, err
     assert json.loads(out)["asked"] == len(rows)
     with (folder / "review.csv").open() as file:
-        frame, k = next((row["frame"], row["k"]) for row in csv.DictReader(file) if row["asked"])
-    assert k == "2000000"
+        row = next(row for row in csv.DictReader(file) if row["asked"])
+    frame, k = row["frame"], row["k"]
+    assert (k, row["score"], row["weight"]) == ("2000000", "", "")
+    assert "are proposals of `curate propose`" in (folder / "README.txt").read_text()
     decide(folder, frame, int(k), "accept")
     code, out, err = curate("review", "import", folder, *options)
     assert code == 0, err
@@ -93,8 +96,27 @@ def test_labeled_frames_lack_nothing(curate: Curate, cars: Workspace) -> None:
     change(cars, "DELETE FROM ground_truth WHERE split = 'val' AND category = 'Car'")
     code, out, err = curate("propose", "-w", cars.root, "--split", "val")
     assert code == 0, err
-    assert "proposals without ground truth in 4 val frames" in out
+    assert "proposed in 4 val frames, at image masks without ground truth" in out
     assert {row[0] for row in stored(cars)} == {0}
+
+
+def test_a_frame_that_fails_keeps_its_proposals(curate: Curate, cars: Workspace) -> None:
+    """The proposals of the others are replaced."""
+    change(cars, "DELETE FROM ground_truth WHERE split = 'val' AND category = 'Car'")
+    options = ("-w", cars.root, "--split", "val")
+    assert curate("propose", *options)[0] == 0
+    rows = stored(cars)
+    change(cars, "UPDATE proposal SET points = 1")
+    frame, key = next(iter(cars.frames("val").items()))
+    change(cars, f"UPDATE proposal SET points = 2 WHERE frame_id = {key}")
+    path = cars.dataset.files(frame).points
+    path.write_bytes(path.read_bytes()[:50])
+    code, _, err = curate("propose", *options)
+    assert (code, "1 frames failed" in err) == (FramesFailed.exit_code, True)
+    assert len(stored(cars)) == len(rows)
+    counts = [row[3] for row in stored(cars)]
+    assert 2 in counts
+    assert 1 not in counts
 
 
 def test_bad_input_is_reported_in_one_line(curate: Curate, cars: Workspace) -> None:
@@ -112,6 +134,7 @@ def test_bad_input_is_reported_in_one_line(curate: Curate, cars: Workspace) -> N
     fails("--split test: use one of", "--split", "test")
     fails("no round has predictions yet; run `curate run` or `curate predict`")
     fails("round 9 has no predictions", "--round", 9)
+    fails("--policy: unknown policy 'luck'", "--round", 1, "--policy", "luck")
     path.write_text(text.replace(TRUE_CARS, "none"))
     fails("segmenter.name is 'none', and proposals are made from its masks")
     path.write_text(text)
