@@ -207,6 +207,9 @@ def describe_audit(found: AuditedRound) -> list[str]:
         sentences.append(f"Not measured: {', '.join(without_fit)}: {found.missing}.")
     if {*CALIBRATED} & {*found.names} - {*without_fit}:
         sentences.append(found.probabilities)
+    left_out = [name for name in CALIBRATED if name not in found.names]
+    if left_out and found.missing and not request.names:
+        sentences.append(f"Left out: {', '.join(left_out)}, because {found.missing}.")
     if not found.figures.counts.counted:
         sentences.append(
             "No object counts: the ground truth of these frames has "
