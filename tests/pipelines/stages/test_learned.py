@@ -269,6 +269,12 @@ def test_a_bound_out_of_reach_is_reported(bounded: Workspace) -> None:
     assert "max_wrong 0.3 is out of reach; the least bound" in summary(bounded)
 
 
+def test_a_bound_without_a_fit_does_not_hold(bounded: Workspace) -> None:
+    """The labels are weighted by another policy, and the summary says what that costs."""
+    store_calibration(bounded, None, REASON)
+    assert f"weighted as by pspsl, and max_wrong does not hold: {REASON}" in summary(bounded)
+
+
 def test_a_bound_without_held_out_frames_is_reported_before_any_work(bounded: Workspace) -> None:
     """With the option that sets frames aside."""
     with pytest.raises(ConfigError, match="curate init --calibration"):
