@@ -364,7 +364,7 @@ def test_too_few_labels_for_a_fit_are_described(workspace: Workspace) -> None:
     found, _ = audit(workspace, split="labeled")
     assert "probability" not in found.names
     text = " ".join(describe_audit(found))
-    assert re.search(r"Left out: learned, probability, because \d correct and \d wrong", text)
+    assert re.search(r"Left out: learned, probability: \d correct and \d wrong", text)
 
 
 def test_a_comparison_with_what_was_not_measured_is_printed(
@@ -402,6 +402,9 @@ def test_val_frames_need_the_calibration_of_the_round(workspace: Workspace) -> N
     # The only coefficient is that of logit(score), so the probability is the score.
     one, other = (found.figures.whole()[name] for name in ("probability", "score"))
     assert one.weighted_recall.value == pytest.approx(other.weighted_recall.value, rel=1e-3)
-    assert "calibration of round 1, which was not fitted to these frames" in " ".join(
-        describe_audit(found)
-    )
+    summary = " ".join(describe_audit(found))
+    assert "calibration of round 1, which was not fitted to these frames" in summary
+    assert "relaxed" not in summary
+    relaxed = workspace.with_settings("calibrate", thresholds="relaxed")
+    summary = " ".join(describe_audit(audit(relaxed)[0]))
+    assert "probability of being correct by bev IoU and relaxed thresholds" in summary
