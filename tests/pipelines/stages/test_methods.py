@@ -24,8 +24,8 @@ from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace, sha256
 
 NAMES = [
-    "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "learned", "threshold", "st3d",
-    "hssda",
+    "baseline", "uda", "uda-cl", "sess", "3dioumatch", "spsl", "pspsl", "learned", "threshold",
+    "st3d", "hssda",
 ]  # fmt: skip
 
 
