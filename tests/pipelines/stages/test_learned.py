@@ -301,3 +301,11 @@ def test_wrong_settings_are_reported_before_any_work(
     code, _, err = curate("status", "-w", workspace.root)
     assert code == ConfigError.exit_code
     assert words in err
+
+
+def test_an_explanation_for_a_policy_without_weights_says_how_to_compute_them(
+    weighted: Workspace,
+) -> None:
+    """As after `run --method learned` in a workspace with another run.method."""
+    with pytest.raises(WorkspaceError, match="no labels weighted by learned; run `curate solve"):
+        explain_label(weighted, next(iter(weighted.frames("unlabeled"))), 0, 1, "learned")
