@@ -132,7 +132,7 @@ def fit_calibration(
     frames, right = len(np.unique(frame_index)), int(correct.sum())
     if frames < FEWEST_FRAMES or right < FEWEST_CORRECT or right == len(correct):
         raise TooFewLabels(
-            f"{right} correct and {len(correct) - right} wrong labels of {frames} frames, a "
+            f"{right} correct and {len(correct) - right} wrong labels of {frames} frames; a "
             f"calibration needs {FEWEST_CORRECT} correct labels, a wrong one, and {FEWEST_FRAMES} "
             "frames"
         )

@@ -50,13 +50,13 @@ class Estimate:
         """Return the figure with the interval that contains a share `level` of its replicates.
 
         Args:
-            value: the figure.
+            value: the figure. If it is NaN, so is the interval.
             replicates: (r,) bootstrap replicates; NaN is skipped. If all are NaN, so is the
                 interval.
             level: coverage of the interval.
         """
         defined = replicates[~np.isnan(replicates)]
-        if not len(defined):
+        if np.isnan(value) or not len(defined):
             return cls(float(value), np.nan, np.nan)
         low, high = np.quantile(defined, [(1 - level) / 2, (1 + level) / 2])
         return cls(float(value), float(low), float(high))

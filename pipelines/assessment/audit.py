@@ -207,6 +207,9 @@ def describe_audit(found: AuditedRound) -> list[str]:
         sentences.append(f"Not measured: {', '.join(without_fit)}: {found.missing}.")
     if {*CALIBRATED} & {*found.names} - {*without_fit}:
         sentences.append(found.probabilities)
+    left_out = [name for name in CALIBRATED if name not in found.names]
+    if left_out and found.missing and not request.names:
+        sentences.append(f"Left out: {', '.join(left_out)}: {found.missing}.")
     if not found.figures.counts.counted:
         sentences.append(
             "No object counts: the ground truth of these frames has "
@@ -334,6 +337,13 @@ def _with_probabilities(
             parts, origin = cross_fitted(workspace, parts, generator)
             return parts, origin, "solve.learned.max_wrong needs val frames to be audited on"
         part, origin = by_the_round(parts[0], sorted(policies))
+        calibrate = workspace.config.calibrate
+        if (calibrate.overlap, calibrate.thresholds) != (request.overlap, "kitti"):
+            origin += (
+                f" It estimates the probability of being correct by {calibrate.overlap} IoU and "
+                f"{calibrate.thresholds} thresholds ([calibrate]), which are not those of this "
+                "audit."
+            )
     except (TooFewLabels, ConfigError, WorkspaceError) as error:
         return parts, "", str(error)
     return [part], origin, ""

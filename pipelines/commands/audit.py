@@ -261,6 +261,8 @@ def _print_differences(figures: "Audit") -> None:
         if not math.isnan((difference := found.differences[name]).value)
         for verdict in ["real" if found.is_real(name) else "may be chance"]
     ]
+    if not rows:
+        return
     print_table(
         ("weight of", "figure", "difference", "interval", ""),
         rows,

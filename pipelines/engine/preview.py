@@ -190,20 +190,26 @@ class Preview:
     def truth(self, stage: RoundStage, policy: str) -> Iterator[PlannedStage]:
         """Yield what a round stage would do with frames that have ground truth.
 
-        Of folds that do not exist yet, nothing is known before their teachers are trained.
+        Of folds that do not exist yet, it is only known that their teachers are to be trained.
         """
         if stage.truth is None or self._plan is None:
             return
         try:
             sources = stage.truth(self._workspace, self._plan.context, policy, create=False)
         except WorkspaceError:
+            for first in self._graph.first_stages:
+                name = f"{first.name} of each fold"
+                yield PlannedStage(0, name, None, (), ("there are no folds yet",), None)
             return
         for source in sources:
             context: RoundContext | None = self._plan.context
             if source.workspace is not self._workspace:
                 context = stored_round(source.workspace, self._number)
+                for first in self._graph.first_stages:
+                    planned = preview_first(source.workspace, first)
+                    yield replace(planned, stage=f"{planned.stage} {source.title}")
             preview = Preview(source.workspace, self._graph, self._number, context)
-            for each in self._graph.before(stage):
+            for each in self._graph.frames_stages:
                 planned = preview.frames_stage(each, source.split)
                 yield replace(planned, stage=f"{planned.stage} {source.title}")
 

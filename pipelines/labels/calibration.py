@@ -56,7 +56,9 @@ def open_usable_policy(workspace: Workspace, round_number: int, name: str) -> tu
         try:
             read_calibration(workspace, round_number)
         except TooFewLabels as error:
-            return open_policy(workspace.config, FALLBACK), f"weighted as by {FALLBACK}: {error}"
+            bound = ", and max_wrong does not hold" if "p_value" in policy.reads else ""
+            reason = f"weighted as by {FALLBACK}{bound}: {error}"
+            return open_policy(workspace.config, FALLBACK), reason
     return policy, ""
 
 

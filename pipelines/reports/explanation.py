@@ -23,7 +23,7 @@ from pipelines.assembly import (
     open_sequence_source,
     score_meaning,
 )
-from pipelines.labels.by_frame import check_weights, weighted_round
+from pipelines.labels.by_frame import check_weights, not_weighted_error, weighted_round
 from pipelines.labels.sources import Source, sources_of
 from pipelines.registry import PRIORS
 from pipelines.reports.probability import (
@@ -176,7 +176,11 @@ def _label(
         query = select(view).where(*(labels[name] == key[name] for name in key))
         row = connection.execute(query).fetchone()
     if row is None:
-        raise _replaced(workspace, frame, k, round_number or 1) or WorkspaceError(
+        if replaced := _replaced(workspace, frame, k, round_number or 1):
+            raise replaced
+        if weighted_round(workspace, policy, round_number or 1) is None:
+            raise not_weighted_error(round_number or 1, policy)
+        raise WorkspaceError(
             f"round {round_number or 1}: {policy} gave no weight to label {k} of frame {frame}; "
             "there is no such label, or the policy dropped it. The view weighted_labels lists all "
             "weighted labels, see `curate query --help`"

@@ -160,7 +160,8 @@ def _column_widths(columns: Sequence[str], cells: Cells, room: int | None) -> li
     for name, values in zip(columns, by_column, strict=True):
         lines = [line for value in (name, *values) for line in value.splitlines() or [""]]
         natural.append(max(map(cell_len, lines)))
-        unbroken = max(cell_len(part) for text in (*name.split(), *values) for part in _parts(text))
+        parts = (part for text in (*name.split(), *values) for part in _parts(text))
+        unbroken = max(map(cell_len, parts), default=0)
         text = any(_is_text(value) for value in values)
         least.append(max(unbroken, min(natural[-1], _TEXT_WIDTH)) if text else unbroken)
     if room is None or sum(natural) <= room:

@@ -62,9 +62,11 @@ def settings(workspace: Workspace, context: RoundContext, policy: str) -> Settin
         "source": source,
         "folds": section.folds if source == "folds" else 0,
         "overlap": section.overlap,
-        "thresholds": _overlaps(workspace.config),
+        # The names of settings in curate.toml: --dry-run reports those that changed.
+        "thresholds": section.thresholds,
+        "overlaps": configured_overlaps(workspace.config),
         "categories": workspace.config.dataset.categories,
-        "held_out": reads_held_out(workspace, policy),
+        "max_wrong": reads_held_out(workspace, policy),
         "split_by": workspace.config.dataset.split_by,
         "seed": context.seed,
         **({} if unseen is None else {"unseen": sorted(unseen)}),

@@ -43,7 +43,7 @@ def check_truth(workspace: Workspace, policy: str, rounds: Iterable[int]) -> Non
     """
     check_held_out(workspace, policy)
     sources = [choose_source(workspace, number) for number in rounds]
-    if "folds" in sources and len(workspace.frames("labeled")) >= FEWEST_FRAMES:
+    if "folds" in sources and _is_enough(workspace, "folds"):
         split_folds(workspace, workspace.config.calibrate.folds, _FOLDS_SETTING)
     if SET_ASIDE in sources and reads_held_out(workspace, policy):
         frames = list(workspace.frames(SET_ASIDE))
@@ -68,9 +68,9 @@ def choose_source(workspace: Workspace, number: int) -> SourceName:
         if obstacles[requested]:
             raise ConfigError(f'calibrate.source = "{requested}": {obstacles[requested]}')
         return requested
-    for name, reason in obstacles.items():
-        if not reason:
-            return name
+    possible = [name for name, reason in obstacles.items() if not reason]
+    if possible:  # too few frames for a fit are used only if there are no others
+        return next((each for each in possible if _is_enough(workspace, each)), possible[0])
     last: SourceName = "folds" if is_trainable(workspace) or number > 1 else "labeled"
     raise ConfigError(f"calibrate: {obstacles[last]}, or {_HOW_TO_SET_ASIDE}")
 
@@ -83,7 +83,7 @@ def truth(
     There are none if too few frames have ground truth: then nothing needs to be trained.
     """
     source, folds = choose_source(workspace, context.number), workspace.config.calibrate.folds
-    if len(workspace.frames("labeled" if source == "folds" else source)) < FEWEST_FRAMES:
+    if not _is_enough(workspace, source):
         return ()
     if source == "folds":
         students = tuple(student_stage(workspace, each) for each in range(1, context.number))
@@ -143,6 +143,11 @@ def _obstacles(workspace: Workspace, number: int) -> dict[SourceName, str]:
         "labeled": _no_labeled(workspace, number),
         "folds": _no_folds(workspace, number),
     }
+
+
+def _is_enough(workspace: Workspace, source: SourceName) -> bool:
+    """Return whether a kind has as many frames as a fit needs."""
+    return len(workspace.frames("labeled" if source == "folds" else source)) >= FEWEST_FRAMES
 
 
 def _no_calibration(workspace: Workspace) -> str:

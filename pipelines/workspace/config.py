@@ -452,7 +452,7 @@ class CalibrateSection(Section):
         description="Frames to learn from: those set aside with `curate init --calibration`; "
         "labeled frames that your detector has not seen (detector.unseen); or folds of the labeled "
         "frames, each with a teacher trained on the others. 'auto' takes the first that is "
-        "possible.",
+        "possible and has at least five frames.",
     )
     folds: Annotated[int, Field(ge=2)] = Field(
         default=5,

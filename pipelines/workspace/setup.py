@@ -235,6 +235,8 @@ def choose_split(
     if calibration:
         # Drawn after the others: those are the same with and without it.
         set_aside = _choose(dataset, held_out, calibration, generator, "calibration", sequences)
+        if not set_aside and Path(calibration).is_file():
+            raise ConfigError(f"--calibration {calibration}: the file lists no frame")
     rest = set(pool) - set(chosen)
     kept = set(held_out) - set(set_aside)
     found = Split(*(tuple(sorted(each)) for each in (chosen, rest, kept, set_aside)))

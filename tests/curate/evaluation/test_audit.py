@@ -7,7 +7,7 @@ import pytest
 from support.audited import WEIGHTS, many_labels, six_labels, small_audit
 
 from curate.detections import as_categories
-from curate.evaluation.audit import COMPARED, audit
+from curate.evaluation.audit import COMPARED, Estimate, audit
 from curate.evaluation.evaluated_labels import EvaluatedLabels
 
 
@@ -177,6 +177,12 @@ def test_precision_at_equal_recall_by_hand():
     assert whole["bad"].equal_recall_precision.value == pytest.approx(1.7 / (1.7 + rest))
     near = part(found, "all", "all", "0-20 m")
     assert near.equal_recall_precision.value == pytest.approx(1 / 2)
+
+
+def test_a_figure_that_cannot_be_computed_has_no_interval():
+    """Even if some draws have it, such as a recall that is within reach in some draws only."""
+    found = Estimate.of(np.nan, np.array([0.4, np.nan, 0.6]), 0.95)
+    assert np.isnan([found.value, found.low, found.high]).all()
 
 
 def test_the_reference_can_be_chosen_and_has_to_give_weight():

@@ -361,7 +361,23 @@ def test_too_few_labels_for_a_fit_are_described(workspace: Workspace) -> None:
     assert found.unmeasured == ("probability",)
     text = " ".join(describe_audit(found))
     assert re.search(r"Not measured: probability: \d correct and \d wrong labels of 1 frames", text)
-    assert "probability" not in audit(workspace, split="labeled")[0].names
+    found, _ = audit(workspace, split="labeled")
+    assert "probability" not in found.names
+    text = " ".join(describe_audit(found))
+    assert re.search(r"Left out: learned, probability: \d correct and \d wrong", text)
+
+
+def test_a_comparison_with_what_was_not_measured_is_printed(
+    curate: Curate, workspace: Workspace
+) -> None:
+    """There is no difference to show then."""
+    code, out, err = curate(
+        *("audit", "-w", workspace.root, "--split", "labeled", "--replicates", "10"),
+        *("--policy", "pspsl", "--policy", "probability"),
+    )
+    assert (code, err) == (0, "")
+    assert "Not measured: probability" in out
+    assert "differences to" not in out
 
 
 def test_val_frames_need_the_calibration_of_the_round(workspace: Workspace) -> None:
@@ -386,6 +402,9 @@ def test_val_frames_need_the_calibration_of_the_round(workspace: Workspace) -> N
     # The only coefficient is that of logit(score), so the probability is the score.
     one, other = (found.figures.whole()[name] for name in ("probability", "score"))
     assert one.weighted_recall.value == pytest.approx(other.weighted_recall.value, rel=1e-3)
-    assert "calibration of round 1, which was not fitted to these frames" in " ".join(
-        describe_audit(found)
-    )
+    summary = " ".join(describe_audit(found))
+    assert "calibration of round 1, which was not fitted to these frames" in summary
+    assert "relaxed" not in summary
+    relaxed = workspace.with_settings("calibrate", thresholds="relaxed")
+    summary = " ".join(describe_audit(audit(relaxed)[0]))
+    assert "probability of being correct by bev IoU and relaxed thresholds" in summary

@@ -71,6 +71,14 @@ def test_a_table_without_rows_shows_its_columns(monkeypatch: pytest.MonkeyPatch)
         assert all(word in screen.text for name in COLUMNS for word in name.split())
 
 
+def test_a_table_without_rows_may_have_a_column_without_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with terminal(monkeypatch, 80) as screen:
+        print_table(("figure", ""), [])
+    assert "figure" in screen.text
+
+
 def test_wide_characters_count_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on the screen."""
     with terminal(monkeypatch, 30) as screen:

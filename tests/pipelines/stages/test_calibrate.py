@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,14 @@ from curate.errors import ConfigError
 from curate.geometry.overlap import bev_iou
 from pipelines.assessment.audit import AuditRequest, run_audit
 from pipelines.engine.executors.serial import SerialExecutor
-from pipelines.engine.runner import run_frames
+from pipelines.engine.preview import preview_all
+from pipelines.engine.runner import run_first, run_frames
 from pipelines.labels.calibration import read_calibration
 from pipelines.labels.label_evidence import further_columns
-from pipelines.round import open_plan
+from pipelines.round import graph_of, open_plan
+from pipelines.stages.calibration_frames import choose_source
 from pipelines.workspace.config import make_config
+from pipelines.workspace.folds import open_folds
 from pipelines.workspace.setup import initialise
 from pipelines.workspace.workspace import Workspace
 
@@ -39,6 +43,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make(data: Path, root: Path, calibration: str = "0.56", **sections: Any) -> Workspace:
     """Return a workspace of 5 labeled, 3 unlabeled, 8 val and 10 frames set aside by default."""
+    root.mkdir(exist_ok=True)
     detector = shutil.copy(data / "detector.txt", root / "detector.txt")
     document: dict[str, Any] = toy_document(data / "kitti", Path(detector))
     document["run"] = {"method": "learned", "executor": "serial", "priors": ("points",)}
@@ -193,6 +198,49 @@ def test_half_of_the_frames_set_aside_are_kept_for_max_wrong(data: Path, tmp_pat
     assert stored(workspace, "calibration_label") == []
     assert "calibrate" in done(workspace)
     assert len(stored(workspace, "calibration_label")) == 24
+
+
+def test_too_few_frames_set_aside_are_used_only_without_others(data: Path, tmp_path: Path) -> None:
+    """Labeled frames are enough for a fit then."""
+    workspace = make(data, tmp_path, calibration="0.22", detector={"unseen": "labeled"})
+    assert len(workspace.frames("calibration")) == 4
+    assert choose_source(workspace, 1) == "labeled"
+    explicit = workspace.with_settings("calibrate", source="calibration")
+    assert choose_source(explicit, 1) == "calibration"
+
+
+def test_a_preview_has_the_stages_of_the_frames_to_learn_from(data: Path, tmp_path: Path) -> None:
+    """It names the teachers of folds too, and the settings in curate.toml that changed."""
+    workspace = make(data, tmp_path)
+    run_workspace(workspace, train=False)
+
+    def planned(workspace: Workspace) -> dict[str, tuple[str, ...]]:
+        found = preview_all(workspace, graph_of(workspace), None)
+        return {each.stage: each.reasons for each in found}
+
+    assert planned(workspace)["calibrate"] == ()
+    for section, values, name in (
+        ("solve", {"learned": {"max_wrong": 0.5}}, "solve.learned.max_wrong"),
+        ("calibrate", {"thresholds": "relaxed"}, "calibrate.thresholds"),
+        ("evaluation", {"overlaps": {**OVERLAPS, "Car": 0.1}}, "evaluation.overlaps.Car"),
+    ):
+        config = workspace.config.model_dump()
+        config[section] |= values
+        changed = replace(workspace, config=make_config(config, "test"))
+        assert planned(changed)["calibrate"] == (f"changed settings: {name}",)
+    trained = make(
+        data,
+        tmp_path / "trained",
+        "",
+        detector={"name": "support.trainable_toy:GridDetector", "path": None},
+        train={"pretrain_steps": 1, "pasted": 0},
+        calibrate={"folds": 2},
+    )
+    for first in graph_of(trained).first_stages:
+        run_first(trained, first, Silent())
+    assert planned(trained)["pretrain of each fold"] == ("there are no folds yet",)
+    list(open_folds(trained, 2))
+    assert planned(trained)["pretrain 1/2"] == ("never ran",)
 
 
 def test_labeled_frames_can_be_used_if_the_detector_has_not_seen_them(

@@ -269,6 +269,12 @@ def test_a_bound_out_of_reach_is_reported(bounded: Workspace) -> None:
     assert "max_wrong 0.3 is out of reach; the least bound" in summary(bounded)
 
 
+def test_a_bound_without_a_fit_does_not_hold(bounded: Workspace) -> None:
+    """The labels are weighted by another policy, and the summary says what that costs."""
+    store_calibration(bounded, None, REASON)
+    assert f"weighted as by pspsl, and max_wrong does not hold: {REASON}" in summary(bounded)
+
+
 def test_a_bound_without_held_out_frames_is_reported_before_any_work(bounded: Workspace) -> None:
     """With the option that sets frames aside."""
     with pytest.raises(ConfigError, match="curate init --calibration"):
@@ -295,3 +301,11 @@ def test_wrong_settings_are_reported_before_any_work(
     code, _, err = curate("status", "-w", workspace.root)
     assert code == ConfigError.exit_code
     assert words in err
+
+
+def test_an_explanation_for_a_policy_without_weights_says_how_to_compute_them(
+    weighted: Workspace,
+) -> None:
+    """As after `run --method learned` in a workspace with another run.method."""
+    with pytest.raises(WorkspaceError, match="no labels weighted by learned; run `curate solve"):
+        explain_label(weighted, next(iter(weighted.frames("unlabeled"))), 0, 1, "learned")
