@@ -67,8 +67,8 @@ def view(
     """
     from curate.errors import ConfigError
     from curate.viewing.palette import find_style
+    from pipelines.labels.by_frame import chosen_round
     from pipelines.labels.of_one_frame import (
-        chosen_round,
         decided_in_frame,
         find_frame,
         weighted_frame_names,

@@ -1,4 +1,4 @@
-"""Checks of the stored weights: whether a round has any, and whether they are in [0, 1]."""
+"""The rounds with predictions and weights, and checks whether weights are in [0, 1]."""
 
 from sqlalchemy import BindParameter, Connection, bindparam, func, or_, select
 
@@ -7,6 +7,27 @@ from curate.exporters.base import bad_weight
 from db import bulk
 from pipelines.registry import POLICIES
 from pipelines.workspace.workspace import Workspace
+
+
+def chosen_round(workspace: Workspace, number: int | None) -> int:
+    """Return the number of the given round, or of the last round with predictions.
+
+    Raises:
+        WorkspaceError: if the round, or every round, has no predictions.
+    """
+    table = bulk.table("prediction")
+    query = select(func.max(table.c.round))
+    if number is not None:
+        query = query.where(table.c.round == number)
+    with workspace.database.reading() as connection:
+        found = connection.execute(query).scalar_one()
+    if found is None:
+        raise WorkspaceError(
+            "no round has predictions yet; run `curate run` or `curate predict`"
+            if number is None
+            else f"round {number} has no predictions; run `curate predict --round {number}`"
+        )
+    return int(found)
 
 
 def weighted_round(workspace: Workspace, policy: str, number: int | None = None) -> int | None:

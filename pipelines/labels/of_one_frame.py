@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from curate.datasets.frame_names import FrameNames
 from curate.detections import Annotations, Detections, as_categories
-from curate.errors import ConfigError, WorkspaceError
+from curate.errors import ConfigError
 from curate.viewing.tags import ShownRepredictions
 from db import bulk
 from db.models import BOX_COLUMNS
@@ -46,27 +46,6 @@ class FrameBoxes:
     def truth_boxes(self) -> np.ndarray | None:
         """(m, 7) ground-truth boxes in the LiDAR frame, NaN for DontCare; None for X_u."""
         return None if self.truth is None else self.truth.boxes
-
-
-def chosen_round(workspace: Workspace, number: int | None) -> int:
-    """Return the number of the given round, or of the last round with predictions.
-
-    Raises:
-        WorkspaceError: if the round, or every round, has no predictions.
-    """
-    table = bulk.table("prediction")
-    query = select(func.max(table.c.round))
-    if number is not None:
-        query = query.where(table.c.round == number)
-    with workspace.database.reading() as connection:
-        found = connection.execute(query).scalar_one()
-    if found is None:
-        raise WorkspaceError(
-            "no round has predictions yet; run `curate run` or `curate predict`"
-            if number is None
-            else f"round {number} has no predictions; run `curate predict --round {number}`"
-        )
-    return int(found)
 
 
 def weighted_frame_names(

@@ -16,8 +16,9 @@ from curate.viewing.frame_view import paint_frame
 from curate.viewing.overlay import FrameContent, draw_overlay
 from curate.viewing.palette import DARK, Style
 from curate.viewing.tags import ShownLabels
+from pipelines.labels.by_frame import chosen_round
 from pipelines.labels.columns import LabelColumns, read_columns
-from pipelines.labels.of_one_frame import FrameBoxes, chosen_round, read_frame
+from pipelines.labels.of_one_frame import FrameBoxes, read_frame
 from pipelines.stages.methods import zero_weight_of
 from pipelines.workspace.workspace import Workspace
 

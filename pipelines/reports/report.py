@@ -14,10 +14,9 @@ from curate.viewing.close_up import CloseUpLabel, draw_close_up
 from curate.viewing.page import Figure, Section, render_page
 from db import bulk
 from db.views import WEIGHTED_LABELS
-from pipelines.labels.by_frame import weighted_round
+from pipelines.labels.by_frame import chosen_round, weighted_round
 from pipelines.labels.columns import read_blocks, read_frame_columns
 from pipelines.labels.human_labels import counts
-from pipelines.labels.of_one_frame import chosen_round
 from pipelines.reports.differences import COLUMNS, ChangedLabel, Comparison, Difference
 from pipelines.reports.figures import (
     beside_others,

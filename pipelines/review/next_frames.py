@@ -17,9 +17,8 @@ from curate.review.next_frames import (
 )
 from curate.review.sheet import Sheet
 from db import bulk
-from pipelines.labels.by_frame import not_weighted_error, weighted_round
+from pipelines.labels.by_frame import chosen_round, not_weighted_error, weighted_round
 from pipelines.labels.columns import LabelColumns, read_columns
-from pipelines.labels.of_one_frame import chosen_round
 from pipelines.review.selection import ReviewRequest, make_sheet
 from pipelines.workspace.workspace import Workspace
 

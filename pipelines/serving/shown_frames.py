@@ -15,8 +15,8 @@ from db import bulk
 from db.evidence import OWN_TABLES, PROBABILITY, evidence_table, label_columns, read_declarations
 from db.labels import label_box, with_fused_boxes
 from db.models import BOX_COLUMNS
+from pipelines.labels.by_frame import chosen_round
 from pipelines.labels.human_labels import DecidedLabels, decided_labels
-from pipelines.labels.of_one_frame import chosen_round
 from pipelines.reports.pictures import frame_picture
 from pipelines.workspace.workspace import Workspace
 

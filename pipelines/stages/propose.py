@@ -24,9 +24,8 @@ from pipelines.engine.executors.base import FrameJob, FrameRows
 from pipelines.engine.mapping import map_frames
 from pipelines.engine.progress import Progress
 from pipelines.engine.runner import open_executor
-from pipelines.labels.by_frame import not_weighted_error, weighted_round
+from pipelines.labels.by_frame import chosen_round, not_weighted_error, weighted_round
 from pipelines.labels.columns import read_columns
-from pipelines.labels.of_one_frame import chosen_round
 from pipelines.review.selection import CONTEXT_WEIGHT, decided_boxes
 from pipelines.stages.reading import FrameReader, ReadsAhead
 from pipelines.workspace.config import Config

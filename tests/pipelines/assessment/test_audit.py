@@ -397,7 +397,7 @@ def test_val_frames_need_the_calibration_of_the_round(workspace: Workspace) -> N
     row |= {"right_labels": 40, "unit": "frame", "held_out_frames": 0, "fit": stored.as_json()}
     with workspace.database.writing() as connection:
         bulk.insert_rows(connection, "calibration", [row])
-    found, _ = audit(workspace)
+    found, _ = audit(workspace.with_settings("calibrate", thresholds="kitti"))
     assert {"learned", "probability"} < {*found.names}
     # The only coefficient is that of logit(score), so the probability is the score.
     one, other = (found.figures.whole()[name] for name in ("probability", "score"))

@@ -91,7 +91,7 @@ def test_the_command_writes_a_table_and_pictures(
     assert code == 0, err
     assert "of 35 labels" not in err
     assert "among 35 labels of 12 frames" in out
-    rows = list(csv.DictReader(table.open()))
+    rows = list(csv.DictReader(table.read_text().splitlines()))
     assert {row["decision"] for row in rows} == {""}
     for row in rows:
         assert (damaged.root / row["picture"]).read_bytes().startswith(b"\x89PNG")

@@ -9,7 +9,7 @@ import pytest
 from support.serving import Pages
 
 from db.models import Base
-from pipelines.labels.of_one_frame import chosen_round
+from pipelines.labels.by_frame import chosen_round
 from pipelines.queries.named_queries import named_queries
 from pipelines.queries.run_query import run_query
 from pipelines.reports.pictures import frame_picture
