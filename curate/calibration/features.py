@@ -86,6 +86,9 @@ class LabelEvidence:
     @classmethod
     def joined(cls, parts: Sequence["LabelEvidence"]) -> "LabelEvidence":
         """Return the labels of all parts, which have the same further columns."""
+        if not parts:
+            none = np.zeros(0)
+            return cls(np.zeros(0, np.str_), none, none, none, none, none, np.zeros((0, 7)))
         columns = {
             name: np.concatenate([part.columns()[name] for part in parts])
             for name in parts[0].columns()

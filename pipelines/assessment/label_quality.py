@@ -12,13 +12,12 @@ from sqlalchemy import select
 
 from curate.evaluation.reliability import (
     auroc,
-    match_to_ground_truth,
     rank_labels,
     weighted_precision,
     weighted_recall,
 )
 from db import bulk
-from pipelines.labels.matching import match_settings, rectangles_in_image
+from pipelines.labels.matching import match_in_frame, match_settings
 from pipelines.workspace.workspace import Workspace, read_truth
 
 
@@ -73,14 +72,8 @@ def judge_labels(workspace: Workspace, round_number: int) -> JudgedLabels:
     objects = 0
     settings = match_settings(workspace.config, "bev")
     for name, key in keys.items():
-        frame = workspace.dataset.read(name, points=False)
-        rectangles = rectangles_in_image(found[key].boxes, frame)
-        matches = match_to_ground_truth(
-            found[key],
-            read_truth(workspace.config, workspace.dataset, name),
-            settings,
-            rectangles,
-        )
+        truth = read_truth(workspace.config, workspace.dataset, name)
+        matches = match_in_frame(workspace, name, found[key], truth, settings)
         objects += sum(matches.ground_truths.values())
         for k in np.flatnonzero(matches.counted):
             correct[key, int(k)] = bool(matches.correct[k])

@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, exists, select
+from sqlalchemy import ColumnElement, Connection, Table, exists, select
 
 from curate.detections import Detections
 from curate.errors import WorkspaceError
@@ -472,8 +472,7 @@ class _Writer:
         policies = select(weight.c.policy).where(*weighted)
         connection.execute(
             task.delete().where(
-                task.c.round == self.round,
-                task.c.stage == "solve",
+                *self._of_the_round(task, "solve"),
                 task.c.variant.in_(policies),
             )
         )
@@ -485,9 +484,11 @@ class _Writer:
         """Delete the calibrations with held-out labels of these frames."""
         task, label = map(bulk.table, ("task", "calibration_label"))
         held_out = exists().where(label.c.round == self.round, label.c.frame_id.in_(keys))
-        connection.execute(
-            task.delete().where(task.c.round == self.round, task.c.stage == "calibrate", held_out)
-        )
+        connection.execute(task.delete().where(*self._of_the_round(task, "calibrate"), held_out))
+
+    def _of_the_round(self, task: Table, stage: str) -> tuple[ColumnElement[bool], ...]:
+        """Return the conditions for the tasks of a round stage, in the form of their index."""
+        return task.c.round == self.round, task.c.stage == stage, task.c.frame_id.is_(None)
 
     def _task(
         self, key: int, state: str, error: str | None, seconds: float, job: Part | None = None

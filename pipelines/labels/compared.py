@@ -7,10 +7,9 @@ from typing import Self
 import numpy as np
 
 from curate.calibration.features import LabelEvidence
-from curate.evaluation.reliability import match_to_ground_truth
 from pipelines.engine.stage import TruthFrames
 from pipelines.labels.label_evidence import read_label_evidence
-from pipelines.labels.matching import match_settings, rectangles_in_image
+from pipelines.labels.matching import match_in_frame, match_settings
 from pipelines.workspace.config import Config
 
 
@@ -43,7 +42,7 @@ class ComparedLabels:
         numbers, flags = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
         return cls(
             tuple(name for part in parts for name in part.frames),
-            _joined([part.evidence for part in parts]),
+            LabelEvidence.joined([part.evidence for part in parts]),
             np.concatenate([numbers, *(p.frame + s for p, s in zip(parts, starts, strict=True))]),
             np.concatenate([numbers, *(part.frame_id for part in parts)]),
             np.concatenate([numbers, *(part.k for part in parts)]),
@@ -84,10 +83,8 @@ def compare_labels(
     order = sorted(found.frames)  # the order of the evidence
     keys, evidence = read_label_evidence(workspace, number, order)
     correct, counted = [np.zeros(0, dtype=bool)], [np.zeros(0, dtype=bool)]
-    for key, labels in workspace.predictions(number, order).items():
-        frame = workspace.dataset.read(names[key], points=False)
-        rectangles = rectangles_in_image(labels.boxes, frame)
-        matches = match_to_ground_truth(labels, truth[names[key]], matching, rectangles)
+    for key, labels in workspace.labels(number, order).items():
+        matches = match_in_frame(workspace, names[key], labels, truth[names[key]], matching)
         correct.append(matches.correct)
         counted.append(matches.counted)
     return ComparedLabels(
@@ -99,16 +96,3 @@ def compare_labels(
         np.concatenate(correct),
         np.concatenate(counted),
     )
-
-
-def _joined(parts: Sequence[LabelEvidence]) -> LabelEvidence:
-    if not parts:
-        none = np.zeros(0)
-        names = np.zeros(0, dtype=np.str_)
-        return LabelEvidence(names, none, none, none, none, none, np.zeros((0, 7)))
-    columns = {
-        name: np.concatenate([part.columns()[name] for part in parts])
-        for name in parts[0].columns()
-    }
-    further = {name: columns.pop(name) for name in parts[0].further}
-    return LabelEvidence(**columns, further=further)

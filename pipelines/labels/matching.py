@@ -4,11 +4,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from curate.detections import Annotations, Detections
 from curate.evaluation.kitti_rules import neighbours_of, overlaps_of
-from curate.evaluation.reliability import MatchSettings, Overlap
+from curate.evaluation.reliability import (
+    LabelMatches,
+    MatchSettings,
+    Overlap,
+    match_to_ground_truth,
+)
 from curate.frames import Frame
 from curate.geometry.projection import box_rectangles
 from pipelines.workspace.config import Config
+from pipelines.workspace.workspace import Workspace
 
 
 def configured_overlaps(config: Config) -> dict[str, float]:
@@ -37,3 +44,23 @@ def match_settings(
 def rectangles_in_image(boxes: np.ndarray, frame: Frame) -> np.ndarray | None:
     """Return (n, 4) projected boxes, see `box_rectangles`; None for a frame without an image."""
     return None if frame.image_size is None else box_rectangles(boxes, frame)
+
+
+def match_in_frame(
+    workspace: Workspace,
+    name: str,
+    labels: Detections,
+    truth: Annotations,
+    settings: MatchSettings,
+) -> LabelMatches:
+    """Return which labels of a frame are correct, wrong or neutral.
+
+    Args:
+        workspace: the workspace, whose data set has the calibration and the size of the image.
+        name: name of the frame.
+        labels: its labels.
+        truth: its ground truth.
+        settings: see `match_settings`.
+    """
+    frame = workspace.dataset.read(name, points=False)
+    return match_to_ground_truth(labels, truth, settings, rectangles_in_image(labels.boxes, frame))

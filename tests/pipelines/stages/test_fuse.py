@@ -17,12 +17,15 @@ from support.silent import Silent
 from curate.detections import Detections
 from curate.evaluation.reliability import MatchSettings, Overlap, match_to_ground_truth
 from curate.fusion import fuse_boxes
+from curate.geometry.overlap import bev_iou
 from curate.geometry.points_in_boxes import count_points_in_boxes
 from db import bulk
 from db.models import BOX_COLUMNS
 from pipelines.assessment.audit import AuditedRound, AuditRequest, run_audit
 from pipelines.commands.audit import print_fusion
 from pipelines.engine.schedule import check_stages
+from pipelines.engine.stage import TruthFrames, TruthSource
+from pipelines.labels.compared import compare_labels
 from pipelines.labels.evidence import read_evidence, read_memory
 from pipelines.labels.of_one_frame import read_frame
 from pipelines.round import graph_of
@@ -216,3 +219,31 @@ def test_results_with_copies_of_their_own_are_fused(
     for key, found in fused.labels(1, list(boxes)).items():
         np.testing.assert_array_equal(found.boxes, boxes[key])
     assert rows(fused, "SELECT count(*) FROM fused_box WHERE boxes = 2")[0][0] > 20
+
+
+def test_a_calibration_judges_the_fused_boxes(views: Workspace) -> None:
+    """Its evidence is that of the fused boxes, so the truth is compared with them as well."""
+    workspace = fusing(views)
+    request = AuditRequest(replicates=10, names=("pspsl",))
+    context = run_audit(workspace, request, Silent(), lambda _: None).context
+    keys, truth = workspace.frames("val"), workspace.ground_truth("val")
+
+    def best(read: Any) -> np.ndarray:
+        found = read(1, list(keys.values()))
+        overlaps = [bev_iou(found[key].boxes, truth[name].boxes) for name, key in keys.items()]
+        return np.concatenate([np.nan_to_num(each).max(axis=1) for each in overlaps])
+
+    fused, plain = best(workspace.labels), best(workspace.predictions)
+    k = int(np.argmax(np.abs(fused - plain)))
+    threshold = (fused[k] + plain[k]) / 2
+    assert ((fused > threshold) != (plain > threshold)).any()
+    frames = TruthFrames(TruthSource(workspace, "val", "val"), context, list(keys.values()), ())
+    overlaps = dict.fromkeys(workspace.config.dataset.categories, float(threshold))
+    found = compare_labels(frames, workspace.config, overlaps)
+    assert found.correct.sum() == (fused > threshold).sum()
+    assert (
+        found.evidence.boxes.tolist()
+        == np.concatenate(
+            [workspace.labels(1, [key])[key].boxes for key in sorted(keys.values())]
+        ).tolist()
+    )
