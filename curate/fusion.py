@@ -14,8 +14,8 @@ import numpy as np
 from curate.detections import Detections
 from curate.shapes import Float, Int
 
-# Headings whose sum is shorter than this share of their weights have no mean, such as two of equal
-# weight at a right angle.
+# Headings have no mean if their sum is shorter than this share of their weights, such as two of
+# equal weight at a right angle.
 _NO_MEAN = 1e-9
 
 

@@ -122,7 +122,7 @@ class Comparison:
     Attributes:
         category: the category, or `ALL`.
         policy: the first policy.
-        other: the policy whose figures are subtracted.
+        other: the policy that it is compared with; its figures are subtracted.
         differences: the difference by figure, for the figures in `COMPARED`.
         conclusive: False if too few sequences were drawn to distinguish a difference from chance.
     """

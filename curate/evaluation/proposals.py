@@ -3,7 +3,7 @@
 Each mask of a category is one candidate: an instance, or a connected part of the semantic map. The
 pixels and points of labels are taken out of it first. The LiDAR points that project into the rest
 are grouped by their distances, without ground, and the group with the most points is the object.
-Its heading is that of the rectangle whose sides the points are closest to (Zhang et al., "Efficient
+Its heading is that of the rectangle with the sides closest to the points (Zhang et al., "Efficient
 L-Shape Fitting for Vehicle Detection Using Laser Scanners", IV 2017). Its size is the mean of the
 category in X_l, or larger if the points are, and it extends from the sides that the LiDAR sees.
 
@@ -224,7 +224,7 @@ def fit_box(
 
 
 def closest_angle(places: Float[np.ndarray, "n 2"], steps: int = 90) -> float:
-    """Return the angle in [0, pi/2) of the rectangle whose sides the points are closest to.
+    """Return the angle in [0, pi/2) of the rectangle with the sides closest to the points.
 
     That is the largest sum of 1 / distance to the nearer side (Zhang et al. 2017, Algorithm 3),
     with at least 5 cm for each distance.

@@ -589,14 +589,14 @@ def _evidence(side: _Side, row: int) -> str:
 def _suspect(side: _Side, row: int, findings: Sequence[Finding], prediction: int) -> Suspect:
     """Return the suspect; findings that hardly matter are left out of its reasons."""
     ordered = sorted(findings, key=lambda each: -each.suspicion)
-    told = [each for each in ordered if each.suspicion >= 0.5] or ordered[:1]
+    listed = [each for each in ordered if each.suspicion >= 0.5] or ordered[:1]
     return Suspect(
         int(side.frame[row]),
         int(side.number[row]),
         prediction,
         str(side.category[row]),
-        combined([each.suspicion for each in told]),
-        tuple(told),
+        combined([each.suspicion for each in listed]),
+        tuple(listed),
     )
 
 

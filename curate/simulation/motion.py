@@ -83,7 +83,7 @@ class Vehicle:
 
 @dataclass(frozen=True)
 class World:
-    """A street whose objects move, seen from a moving vehicle.
+    """A street with moving objects, seen from a moving vehicle.
 
     Attributes:
         street: the street at time 0.

@@ -6,7 +6,7 @@ matched to the ground truth.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -28,13 +28,13 @@ from pipelines.assessment.audited_probabilities import (
     check_calibration,
     cross_fitted,
 )
+from pipelines.assessment.trained_folds import ReportCallback, trained_folds
 from pipelines.engine.plan import Plan
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable
-from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
+from pipelines.engine.runner import Report, check_inputs, open_executor, run_frames
 from pipelines.engine.stage import RoundContext
-from pipelines.round import graph_of, open_plan
-from pipelines.workspace.folds import open_folds
+from pipelines.round import open_plan
 from pipelines.workspace.workspace import Workspace
 
 POLICIES = ("pspsl", "spsl", "threshold", "uniform")
@@ -47,8 +47,6 @@ EVIDENCE: Mapping[str, Callable[[Evidence], np.ndarray]] = {
 """Evidence to audit like a weight, each in [0, 1]; no training uses it as a weight directly."""
 CALIBRATED = ("learned", "probability")
 """Names that are audited by default only where there are probabilities."""
-
-ReportCallback = Callable[[Report], None]
 
 
 @dataclass(frozen=True)
@@ -281,14 +279,7 @@ def _audited_splits(
         plan = open_plan(workspace, request.round_number, split=request.split)
         yield plan, request.split, record
         return
-    for number, fold in enumerate(open_folds(workspace, request.folds), start=1):
-        suffix = f" {number}/{request.folds}"
-
-        def done(report: Report, suffix: str = suffix) -> None:
-            record(replace(report, stage=report.stage + suffix))
-
-        for first in graph_of(fold).first_stages:
-            done(run_first(fold, first, progress))
+    for fold, done in trained_folds(workspace, request.folds, progress, record):
         yield open_plan(fold, 1, split="val"), "val", done
 
 

@@ -29,12 +29,12 @@ from curate.viewing.canvas import save_png
 from curate.viewing.close_up import CloseUpLabel, draw_close_up
 from db.models import BOX_COLUMNS
 from pipelines.assembly import check_executor, open_segmenter
+from pipelines.assessment.trained_folds import trained_folds
 from pipelines.engine.progress import Progress
 from pipelines.engine.rounds import is_trainable, recorded_config
-from pipelines.engine.runner import Report, check_inputs, open_executor, run_first, run_frames
+from pipelines.engine.runner import Report, check_inputs, open_executor, run_frames
 from pipelines.labels.matching import rectangles_in_image
-from pipelines.round import graph_of, open_plan
-from pipelines.workspace.folds import open_folds
+from pipelines.round import open_plan
 from pipelines.workspace.workspace import Workspace
 
 _log = logging.getLogger(__name__)
@@ -330,13 +330,7 @@ def _predict_folds(
     workspace: Workspace, folds: int, progress: Progress, record: Callable[[Report], None]
 ) -> Iterator[dict[str, Detections]]:
     """Yield the predictions of each fold's teacher on the frames that it has not seen."""
-    for number, fold in enumerate(open_folds(workspace, folds), start=1):
-
-        def done(report: Report, number: int = number) -> None:
-            record(replace(report, stage=f"{report.stage} {number}/{folds}"))
-
-        for first in graph_of(fold).first_stages:
-            done(run_first(fold, first, progress))
+    for fold, done in trained_folds(workspace, folds, progress, record):
         yield _predict(fold, "val", 1, progress, done)
 
 

@@ -176,7 +176,7 @@ class _Runs:
 
     @classmethod
     def joined(cls, blocks: Sequence["_Runs"]) -> "_Runs":
-        """Return the runs of all blocks; a run that a block ended goes on in the next one."""
+        """Return the runs of all blocks; a run may continue in the next block."""
         if not blocks:
             return cls(np.empty(0, "S1"), np.empty((0, 3), np.int64), np.empty(0, np.int64))
         names = np.concatenate([each.names for each in blocks])
